@@ -1,0 +1,69 @@
+# make run      set up, then train: make run task=laikago_trot method=twostage budget=fast seed=0
+# make test     set up, then run the tests
+# make check    set up, then lint, format and types
+# make setup    the virtual environment .venv with the pinned packages
+# make bench    speed of the batched simulation
+# make clean    remove what was made here, but not runs/
+#
+# `make run` hands all its key=value words to `tsbench run`; those in capitals are for make:
+# ARGS for other words, such as ARGS='-m seed=0,1', and PYTHON for the interpreter.
+
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.set-up
+PYTHON ?= $(firstword $(foreach name,python3.12 python3.11 python3,\
+	$(shell $(name) -c 'import sys; (3, 11) <= sys.version_info < (3, 13) and print("$(name)")' 2>/dev/null)))
+ARGS ?=
+
+# The words of the command line, each quoted for the shell. In MAKEOVERRIDES make has doubled every
+# dollar and backslash, and put a backslash before every space.
+empty :=
+space := $(empty) $(empty)
+plain = $(subst \\,\,$(subst $$$$,$$,$(subst <blank>,$(space),$1)))
+quoted = '$(subst ','\'',$(call plain,$1))'
+given = $(filter-out ARGS=% PYTHON=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
+words = $(if $(filter task=%,$(given)),,task=laikago_trot) $(foreach word,$(given),$(call quoted,$(word)))
+
+.PHONY: help setup system run test check format bench clean
+
+help:
+	@sed -n 's/^# \(make .*\)/  \1/p' Makefile
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "tsbench: Python 3.11 or 3.12 is needed; none is on PATH" >&2; exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || .ci/debian python3-venv
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "tsbench: installing the pinned packages into $(VENV), which takes some minutes the first time"
+	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+run: setup
+	@$(BIN)/tsbench run $(words) $(ARGS)
+
+# Pictures and pages are tested with a software renderer and a headless browser.
+system:
+	@.ci/debian libosmesa6 chromium
+
+test: setup system
+	$(BIN)/python -m pytest --numprocesses=auto $(ARGS)
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: setup
+	@$(BIN)/tsbench bench $(ARGS)
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find tsbench tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,47 @@
+"""What many tests share: plans and reference motions made without learning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tsbench import tasks
+from tsbench.motion import Plan, ReferenceMotion
+from tsbench.sim.kinematic import Planning
+
+
+@cache
+def _naive_plan(name: str) -> Plan:
+    task = tasks.make(name)
+    planning = Planning(task)
+    abstraction = planning.abstraction
+    state = abstraction.start(1)
+    states = [abstraction.flatten(state)[0]]
+    rewards: list[float] = []
+    while len(rewards) < planning.horizon and not planning.terminal(state)[0]:
+        action = abstraction.naive(state)
+        following = planning.advance(state, action)
+        rewards.append(planning.reward(state, action, following)[0])
+        states.append(abstraction.flatten(following)[0])
+        state = following
+    return Plan(name, task.version, planning.timestep, np.array(states), np.array(rewards))
+
+
+@cache
+def _naive_reference(name: str) -> ReferenceMotion:
+    return tasks.make(name).reference(_naive_plan(name))
+
+
+@pytest.fixture(scope="session")
+def naive_plan() -> Callable[[str], Plan]:
+    """Of a task: the plan that its hand-made planner makes."""
+    return _naive_plan
+
+
+@pytest.fixture(scope="session")
+def naive_reference() -> Callable[[str], ReferenceMotion]:
+    """Of a task: that plan as full poses."""
+    return _naive_reference

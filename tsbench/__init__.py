@@ -1,0 +1,126 @@
+"""tsbench: control problems that are too sparse or too sensitive for plain reinforcement learning.
+
+import tsbench
+
+environment = tsbench.load("laikago_trot")
+time_step = environment.reset()
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any, Literal
+
+from tsbench.errors import TsbenchError, unknown
+from tsbench.gl import choose_backend
+
+if TYPE_CHECKING:
+    from dm_control.rl.control import Environment
+
+    from tsbench.motion import ReferenceMotion
+    from tsbench.sim.batched import BatchedEnvironment
+
+choose_backend()
+
+try:
+    __version__ = version("tsbench")
+except PackageNotFoundError:  # a checkout on the path that was never installed
+    __version__ = "0+unknown"
+
+__all__ = ["TsbenchError", "list_methods", "list_tasks", "load", "load_batched"]
+
+Variant = Literal["planning", "imitation"]
+VARIANTS: tuple[Variant, ...] = ("planning", "imitation")
+
+
+def list_tasks() -> tuple[str, ...]:
+    """The names that `load` takes."""
+    from tsbench import tasks
+
+    return tasks.names()
+
+
+def list_methods() -> tuple[str, ...]:
+    """The names that `tsbench run method=...` takes."""
+    from tsbench import methods
+
+    return methods.names()
+
+
+def load(
+    name: str,
+    variant: Variant | None = None,
+    *,
+    reference: ReferenceMotion | None = None,
+    seed: int | None = None,
+    perturbed: bool = False,
+    **constants: Any,
+) -> Environment:
+    """One dm_control environment of a task.
+
+    Args:
+        name: of the task.
+        variant: "planning" for its kinematic variant, "imitation" for the one whose reward
+            follows `reference`, None for the task itself.
+        reference: what the imitation variant imitates.
+        seed: of the random starts, None for fresh entropy.
+        perturbed: whether episodes begin near the task's start instead of at it.
+        constants: changes to what defines the task, for studies.
+
+    Raises:
+        TsbenchError: an unknown name, or an imitation variant without a reference.
+    """
+    from tsbench.sim.single import environment
+
+    mdp = _variant(name, variant, reference, perturbed, constants)
+    return environment(mdp, seed, perturbed=perturbed)
+
+
+def load_batched(
+    name: str,
+    variant: Variant | None = None,
+    *,
+    count: int,
+    reference: ReferenceMotion | None = None,
+    seed: int = 0,
+    perturbed: bool = False,
+    threads: int | None = None,
+    **constants: Any,
+) -> BatchedEnvironment[Any]:
+    """`count` environments of a task stepped together; arguments otherwise as in `load`.
+
+    `threads` None means all cores.
+    """
+    from tsbench.sim.batched import BatchedEnvironment, Physics
+    from tsbench.sim.kinematic import Planning
+
+    mdp = _variant(name, variant, reference, perturbed, constants)
+    dynamics: Any = mdp
+    if not isinstance(mdp, Planning):
+        dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed)
+    return BatchedEnvironment(mdp, dynamics, count, seed)
+
+
+def _variant(
+    name: str,
+    variant: str | None,
+    reference: ReferenceMotion | None,
+    perturbed: bool,
+    constants: dict[str, Any],
+) -> Any:
+    from tsbench import tasks
+    from tsbench.sim.kinematic import Planning
+    from tsbench.sim.tracking import Imitation
+
+    task = tasks.make(name, **constants)
+    if variant is None:
+        return task
+    if variant == "planning":
+        if perturbed:
+            raise TsbenchError("the planning variant has no perturbed starts")
+        return Planning(task)
+    if variant == "imitation":
+        if reference is None:
+            raise TsbenchError("the imitation variant needs a reference motion: reference=...")
+        return Imitation(task, reference)
+    raise unknown("variant", str(variant), VARIANTS)

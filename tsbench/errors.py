@@ -1,0 +1,43 @@
+"""What a user can get wrong, told in one line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class TsbenchError(Exception):
+    """A mistake that the user can mend.
+
+    The message is one line in plain words. The command line prints it after `tsbench: ` on the
+    error stream and exits with status 2; no traceback is shown.
+    """
+
+
+def unknown(kind: str, given: str, allowed: Iterable[str]) -> TsbenchError:
+    """The error for a name that does not exist, with the nearest one that does.
+
+    Args:
+        kind: what was named, e.g. "task".
+        given: the name given.
+        allowed: the names that exist.
+    """
+    names = sorted(allowed)
+    message = f"unknown {kind} '{given}'; allowed: {', '.join(names) or 'none'}"
+    near = difflib.get_close_matches(given, names, n=1)
+    return TsbenchError(message + (f" (did you mean '{near[0]}'?)" if near else ""))
+
+
+@contextmanager
+def os_errors(path: Path | str) -> Iterator[None]:
+    """Turns what the operating system refuses (disk full, no permission) into one line.
+
+    Args:
+        path: what is being read or written; named where the refusal names no file itself.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise TsbenchError(f"{error.filename or path}: {error.strerror or error}") from None
