@@ -1,0 +1,61 @@
+"""MJCF to compiled models."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from tsbench.errors import TsbenchError
+
+# A wheel ships models/ inside the package; a checkout has it beside the package.
+_FOLDERS = (
+    Path(__file__).parents[1] / "models",
+    Path(__file__).parents[2] / "models",
+)
+
+
+def model_path(name: str) -> Path:
+    """The hand-written MJCF of that name.
+
+    Raises:
+        TsbenchError: the installation lacks it.
+    """
+    for folder in _FOLDERS:
+        path = folder / f"{name}.xml"
+        if path.is_file():
+            return path
+    raise TsbenchError(f"the installation lacks models/{name}.xml: install tsbench again")
+
+
+def load_spec(name: str) -> mujoco.MjSpec:
+    """The MJCF of that name, open to additions."""
+    return mujoco.MjSpec.from_file(str(model_path(name)))
+
+
+@cache
+def compiled(name: str) -> mujoco.MjModel:
+    """The MJCF of that name as it is; for reading only."""
+    model: mujoco.MjModel = load_spec(name).compile()
+    return model
+
+
+def fingerprint(spec: mujoco.MjSpec) -> str:
+    """Hash of a task's physics: equal if and only if the compiled models are."""
+    model = spec.compile()
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return hashlib.sha256(buffer.tobytes()).hexdigest()
+
+
+def sensor_slices(model: mujoco.MjModel) -> dict[str, slice]:
+    """Where each sensor's values lie in `sensordata`."""
+    return {
+        model.sensor(i).name: slice(
+            int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i])
+        )
+        for i in range(model.nsensor)
+    }
