@@ -1,0 +1,198 @@
+"""Plans and reference motions: what passes from the planning stage to the imitation stage."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from tsbench.errors import TsbenchError
+
+# What numpy and zipfile raise on files that are not what they should be. RuntimeError covers
+# encrypted members and unknown compression methods.
+_DAMAGE = (
+    OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, MemoryError, OverflowError,
+    zlib.error, zipfile.BadZipFile, struct.error,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """Arrays over time with their origin, kept in one npz file that holds no code."""
+
+    kind: ClassVar[str]
+    time_axes: ClassVar[dict[str, int]]  # array name -> its number of dimensions
+
+    task: str
+    task_version: int
+    timestep: float
+
+    def __post_init__(self) -> None:
+        problem = self._problem()
+        if problem:
+            raise TsbenchError(f"not a valid {self.kind}: {problem}")
+
+    def _problem(self) -> str | None:
+        if not (np.isfinite(self.timestep) and self.timestep > 0.0):
+            return f"the time step is {self.timestep}, it must be positive"
+        for name, ndim in self.time_axes.items():
+            array = getattr(self, name)
+            if array.ndim != ndim:
+                return f"{name} has {array.ndim} dimensions, it must have {ndim}"
+            if array.dtype != (bool if name == "contacts" else np.float64):
+                return f"{name} is of type {array.dtype}"
+            if not np.all(np.isfinite(array)):
+                return f"{name} holds values that are not finite"
+        return None
+
+    def save(self, path: Path | str) -> None:
+        """Writes the recording; the file appears whole or not at all."""
+        path = Path(path)
+        temporary = path.with_name(path.name + ".part")
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, kind=self.kind, **dataclasses.asdict(self))
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads a recording.
+
+        Raises:
+            TsbenchError: the file is missing, damaged, or of another kind.
+        """
+        path = Path(path)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                content = {name: file[name] for name in file.files}
+        except FileNotFoundError:
+            raise TsbenchError(f"no {cls.kind} at {path}") from None
+        except _DAMAGE as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise TsbenchError(f"damaged {cls.kind} file {path}: {reason}") from None
+        found = str(content.pop("kind", "unknown"))
+        if found != cls.kind:
+            raise TsbenchError(f"{path} is not a {cls.kind} file (it says: {found})")
+        names = {field.name for field in dataclasses.fields(cls)}
+        if names != set(content):
+            differing = ", ".join(sorted(names ^ set(content)))
+            raise TsbenchError(f"damaged {cls.kind} file {path}: missing or unknown {differing}")
+        try:
+            return cls(**{name: _plain(value) for name, value in content.items()})
+        except (TsbenchError, TypeError, ValueError, AttributeError) as error:
+            raise TsbenchError(f"damaged {cls.kind} file {path}: {error}") from None
+
+
+def _plain(value: np.ndarray) -> Any:
+    return value.item() if value.ndim == 0 else value
+
+
+@dataclass(frozen=True)
+class Plan(_Recording):
+    """The abstract trajectory of the planning stage.
+
+    Attributes:
+        states: abstract coordinates (`Abstraction.coordinates`), shape (T + 1, n).
+        rewards: planning reward of each step, shape (T,).
+    """
+
+    kind: ClassVar[str] = "plan"
+    time_axes: ClassVar[dict[str, int]] = {"states": 2, "rewards": 1}
+
+    states: np.ndarray
+    rewards: np.ndarray
+
+    def _problem(self) -> str | None:
+        if problem := super()._problem():
+            return problem
+        if len(self.states) != len(self.rewards) + 1 or len(self.states) < 2:
+            return f"{len(self.states)} states and {len(self.rewards)} rewards do not match"
+        return None
+
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds of each state, shape (T + 1,)."""
+        return np.arange(len(self.states)) * self.timestep
+
+
+@dataclass(frozen=True)
+class ReferenceMotion(_Recording):
+    """A plan as full poses at the control rate.
+
+    Attributes:
+        qpos: generalised positions, shape (T + 1, nq).
+        qvel: generalised velocities by central differences, shape (T + 1, nv).
+        feet: foot centres in the world frame in metres, shape (T + 1, feet, 3).
+        contacts: the feet's scheduled contacts, shape (T + 1, feet).
+        com: whole-body centre of mass in the world frame in metres, shape (T + 1, 3).
+    """
+
+    kind: ClassVar[str] = "reference motion"
+    time_axes: ClassVar[dict[str, int]] = {
+        "qpos": 2, "qvel": 2, "feet": 3, "contacts": 2, "com": 2,
+    }  # fmt: skip
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    feet: np.ndarray
+    contacts: np.ndarray
+    com: np.ndarray
+
+    def _problem(self) -> str | None:
+        if problem := super()._problem():
+            return problem
+        lengths = {name: len(getattr(self, name)) for name in self.time_axes}
+        if len(set(lengths.values())) != 1 or lengths["qpos"] < 2:
+            return f"the lengths do not match: {lengths}"
+        return None
+
+    @property
+    def steps(self) -> int:
+        return len(self.qpos) - 1
+
+    @property
+    def duration(self) -> float:
+        """Seconds."""
+        return self.steps * self.timestep
+
+    def frame(self, time: np.ndarray) -> np.ndarray:
+        """Index of the frame at each time in seconds; the last one beyond the end."""
+        return np.clip(np.rint(time / self.timestep).astype(int), 0, self.steps)
+
+
+@dataclass(frozen=True)
+class AuditItem:
+    """One measured property of a plan or reference motion against what is allowed."""
+
+    what: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        return bool(self.value <= self.limit)
+
+    def __str__(self) -> str:
+        verdict = "ok" if self.passed else "TOO MUCH"
+        return f"{self.what}: {self.value:.3g} {self.unit} (at most {self.limit:.3g}) {verdict}"
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Whether a plan can be followed at all, in plain words."""
+
+    items: tuple[AuditItem, ...]
+
+    @property
+    def passed(self) -> bool:
+        return all(item.passed for item in self.items)
+
+    @property
+    def failures(self) -> tuple[AuditItem, ...]:
+        return tuple(item for item in self.items if not item.passed)

@@ -1,0 +1,1 @@
+"""From abstract states to poses, and planners that do not learn."""

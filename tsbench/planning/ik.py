@@ -1,0 +1,84 @@
+"""Inverse kinematics: full poses for a legged robot from its base and feet, by mink."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mink
+import mujoco
+import numpy as np
+
+SOLVER = "daqp"
+TOLERANCE = 1e-4  # m: feet this close to their targets are there
+MAX_ITERATIONS = 50
+GAIN = 1.0  # full Gauss-Newton steps: mink divides them by the time step, we multiply it back
+DT = 1.0
+
+
+class FootPoses:
+    """Joint angles that put the feet where they are wanted while the base stays put.
+
+    Each solution starts from the one before, so neighbouring targets give neighbouring poses.
+    """
+
+    def __init__(self, model: mujoco.MjModel, feet: Sequence[str], home: np.ndarray) -> None:
+        """
+        Args:
+            model: a robot whose first joint is free.
+            feet: names of the sites at the foot centres.
+            home: generalised positions that the first solution starts from, shape (nq,).
+        """
+        self._configuration = mink.Configuration(model, q=home.copy())
+        self._tasks = [
+            mink.FrameTask(foot, "site", position_cost=1.0, orientation_cost=0.0, gain=GAIN)
+            for foot in feet
+        ]
+        self._freeze = [mink.DofFreezingTask(model, dof_indices=list(range(6)))]
+        self._limits = [mink.ConfigurationLimit(model)]
+
+    def solve(self, base: np.ndarray, feet: np.ndarray) -> tuple[np.ndarray, float]:
+        """One pose.
+
+        Args:
+            base: base position and orientation quaternion (w, x, y, z), shape (7,).
+            feet: foot centres in the world frame in metres, shape (feet, 3).
+
+        Returns:
+            Generalised positions, shape (nq,), and the largest distance that remains between a
+            foot and its target in metres. It is the caller who judges that: joint limits always
+            hold, so a target out of reach keeps a distance.
+        """
+        q = self._configuration.q.copy()
+        q[:7] = base
+        self._configuration.update(q)
+        for task, target in zip(self._tasks, feet, strict=True):
+            task.set_target(mink.SE3.from_translation(target))
+        residual = self._residual()
+        for _ in range(MAX_ITERATIONS):
+            if residual < TOLERANCE:
+                break
+            try:
+                velocity = mink.solve_ik(
+                    self._configuration,
+                    self._tasks,
+                    DT,
+                    SOLVER,
+                    damping=1e-8,
+                    limits=self._limits,
+                    constraints=self._freeze,
+                )
+            except mink.NoSolutionFound:
+                break
+            self._configuration.integrate_inplace(velocity, DT)
+            improved = self._residual()
+            if improved > 0.999 * residual:  # as near as the limits let it come
+                residual = improved
+                break
+            residual = improved
+        return self._configuration.q.copy(), residual
+
+    def _residual(self) -> float:
+        errors = [
+            np.linalg.norm(task.compute_error(self._configuration)[:3]) for task in self._tasks
+        ]
+        return float(max(errors))

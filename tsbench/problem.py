@@ -1,0 +1,70 @@
+"""What a method is given: a problem to solve, and a workspace to report to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from tsbench.mdp import Task
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much a run may use.
+
+    Attributes:
+        plan: environment steps of the planning variant.
+        act: environment steps of the task or its imitation variant. A method without a planning
+            stage may use both (paper: monolithic gets the sum).
+        environments: how many are stepped together, instead of the training settings' number.
+    """
+
+    plan: int
+    act: int
+    environments: int | None = None
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a method has to solve, and with what.
+
+    Attributes:
+        task: in full physics.
+        budget: environment steps of each kind.
+        training: changes to the PPO settings by kind of stage (`rl.stages.KINDS`).
+        options: of the method, as its config has them.
+        seed: of all randomness.
+        threads: for the physics, or None for all cores.
+    """
+
+    task: Task[Any]
+    budget: Budget
+    training: Mapping[str, Mapping[str, Any]]
+    options: Mapping[str, Any]
+    seed: int
+    threads: int | None
+
+
+class Monitor(Protocol):
+    """Takes a stage's figures, once per iteration."""
+
+    physics_substeps: int
+
+    def update(self, steps: int, metrics: Mapping[str, float]) -> None:
+        """`steps`: environment steps of this stage so far."""
+
+
+class Workspace(Protocol):
+    """Where a method reports and leaves what it makes."""
+
+    @property
+    def directory(self) -> Path: ...
+
+    def stage(self, name: str, steps: int) -> AbstractContextManager[Monitor]:
+        """A stage that may use that many environment steps."""
+
+    def note(self, line: str) -> None:
+        """Tells the user something in plain words."""

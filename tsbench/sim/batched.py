@@ -1,0 +1,147 @@
+"""Many episodes of one MDP at once.
+
+The physics runs on `mujoco.batch`, which steps every simulation on a pool of threads that is as
+wide as the machine and then brings position and velocity sensors up to date. Measured on two
+cores with Laikago (`tsbench bench`), it is as fast as the bare `mujoco.rollout` loop, which leaves
+the sensors one substep behind and needs an extra step to mend that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from tsbench.mdp import MDP, Array, Readings, Rng, S, Start, Task
+from tsbench.sim.model import sensor_slices
+
+_CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
+
+
+class Dynamics(Protocol[S]):
+    """What turns actions into states, for a fixed number of episodes."""
+
+    def begin(self, rng: Rng, rows: np.ndarray) -> S:
+        """Starts new episodes in `rows` and returns their states."""
+
+    def advance(self, state: S, action: Array) -> S:
+        """The states of all episodes one time step later."""
+
+
+class Physics(Generic[S]):
+    """A task's full physics.
+
+    Attributes:
+        batch: the simulations; a write to `batch.xfrc_applied` pushes them.
+        substeps: physics steps done so far, all episodes together.
+    """
+
+    def __init__(
+        self, task: Task[S], count: int, *, threads: int | None = None, perturbed: bool = False
+    ) -> None:
+        """`threads` None means all cores; `perturbed` picks the task's perturbed starts."""
+        self.task = task
+        self.perturbed = perturbed
+        self.substeps = 0
+        spec = task.spec()
+        spec.compiler.discardvisual = True  # 10 % faster, the same states to the last bit
+        model = spec.compile()
+        self.batch = Batch(model, count, threads or 0)
+        self._sensors = sensor_slices(model)
+        self._qpos = self.batch.bind("qpos")
+        self._qvel = self.batch.bind("qvel")
+        self._ctrl = self.batch.bind("ctrl")
+        self._sensordata = self.batch.bind("sensordata")
+
+    def begin(self, rng: Rng, rows: np.ndarray) -> S:
+        return self.place(rows, self.task.start(rng, len(rows), perturbed=self.perturbed))
+
+    def place(self, rows: np.ndarray, start: Start) -> S:
+        """Puts the simulations in `rows` where `start` says and returns their states."""
+        ids = np.asarray(rows, np.int32)
+        self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self._qpos[rows] = start.qpos
+        self._qvel[rows] = start.qvel
+        self.batch.forward(ids, stage=_CURRENT)
+        return self._read(rows, start.time, start.memory)
+
+    def advance(self, state: S, action: Array) -> S:
+        control, memory = self.task.control(state, action)
+        self._ctrl[:] = control
+        self.batch.step(nstep=self.task.substeps, stage=_CURRENT)
+        self.substeps += len(control) * self.task.substeps
+        return self._read(slice(None), state.time + self.task.timestep, memory)
+
+    def _read(self, rows: Any, time: np.ndarray, memory: np.ndarray) -> S:
+        # Copies: the batch's arrays change under whoever holds them.
+        sensordata = self._sensordata[rows].copy()
+        return self.task.read(
+            Readings(
+                time=time,
+                qpos=self._qpos[rows].copy(),
+                qvel=self._qvel[rows].copy(),
+                sensors={name: sensordata[..., part] for name, part in self._sensors.items()},
+                memory=memory,
+            )
+        )
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What a step gave; shapes (n,) but for the observation.
+
+    Attributes:
+        observation: of the state that follows; where an episode ended, of the next one's start.
+        reward: of the step.
+        terminal: the episode ended for a reason other than its last step.
+        truncated: the episode ended with its last step.
+    """
+
+    observation: np.ndarray
+    reward: np.ndarray
+    terminal: np.ndarray
+    truncated: np.ndarray
+
+
+class BatchedEnvironment(Generic[S]):
+    """Episodes of an MDP that are stepped together and begin anew as they end.
+
+    Attributes:
+        state: of all episodes.
+        steps: steps taken in each episode since its start, shape (n,). An episode that starts
+            along a reference motion starts with the steps that lie before.
+    """
+
+    def __init__(self, mdp: MDP[S], dynamics: Dynamics[S], count: int, seed: int) -> None:
+        self.mdp = mdp
+        self.dynamics = dynamics
+        self.count = count
+        self.rng = np.random.default_rng(seed)
+        self.state: S
+        self.steps = np.zeros(count, int)
+
+    def reset(self) -> np.ndarray:
+        """Starts all episodes; returns the observations, shape (n, observation_size)."""
+        self.state = self.dynamics.begin(self.rng, np.arange(self.count))
+        self.steps = np.rint(self.state.time / self.mdp.timestep).astype(int)
+        observation: np.ndarray = self.mdp.observation(self.state)
+        return observation
+
+    def step(self, action: np.ndarray) -> Transition:
+        """One time step of all episodes; `action` has shape (n, action_size)."""
+        previous = self.state
+        state = self.dynamics.advance(previous, action)
+        self.steps += 1
+        reward = self.mdp.reward(previous, action, state)
+        terminal = self.mdp.terminal(state)
+        truncated = (self.steps >= self.mdp.horizon) & ~terminal
+        ended = np.flatnonzero(terminal | truncated)
+        if len(ended):
+            fresh = self.dynamics.begin(self.rng, ended)
+            self.steps[ended] = np.rint(fresh.time / self.mdp.timestep).astype(int)
+            state = state.updated(ended, fresh)
+        self.state = state
+        return Transition(self.mdp.observation(state), reward, terminal, truncated)

@@ -1,0 +1,64 @@
+"""The planning variant of a task: its reward, start and ending under kinematic dynamics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tsbench.mdp import MDP, Array, Rng, S, Task
+
+
+class Planning(MDP[S]):
+    """A task in which one samples states: s' = s + a.
+
+    The reward is the task's own times the abstraction's `dynamics_reward`, so there is no second
+    reward that could drift away from the first.
+    """
+
+    def __init__(self, task: Task[S], *, explore: float = 0.0) -> None:
+        """`explore` is the share of episodes that begin at a sampled state instead of the start:
+        in kinematics any state can be visited at will, which is what makes planning easy."""
+        self.task = task
+        self.explore = explore
+        self.abstraction = task.abstraction()
+        self.name = task.name
+        self.version = task.version
+        self.horizon = self.abstraction.horizon
+        self.timestep = self.abstraction.timestep
+        self.observation_size = self.abstraction.observation_size
+        self.action_size = self.abstraction.action_size
+        self.max_reward = task.max_reward
+
+    def observation(self, state: S) -> Array:
+        return self.abstraction.observation(state)
+
+    def value_observation(self, state: S) -> Array:
+        if self.abstraction.value_observation is None:
+            return self.observation(state)
+        return self.abstraction.value_observation(state)
+
+    def reward(self, previous: S, action: Array, state: S) -> Array:
+        reward = self.task.reward(previous, action, state)
+        if self.abstraction.dynamics_reward is not None:
+            reward = reward * self.abstraction.dynamics_reward(state)
+        return reward
+
+    def terminal(self, state: S) -> Array:
+        return self.task.terminal(state)
+
+    def reached(self, state: S) -> Array:
+        return self.task.reached(state)
+
+    def violated(self, state: S) -> Array:
+        return self.task.violated(state)
+
+    # Its dynamics, for BatchedEnvironment
+
+    def begin(self, rng: Rng, rows: np.ndarray) -> S:
+        start = self.abstraction.start(len(rows))
+        if not self.explore:
+            return start
+        sampled = np.flatnonzero(rng.uniform(size=len(rows)) < self.explore)
+        return start.updated(sampled, self.abstraction.sample(rng, len(sampled)))
+
+    def advance(self, state: S, action: Array) -> S:
+        return self.abstraction.advance(state, action)

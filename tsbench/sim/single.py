@@ -1,0 +1,164 @@
+"""One episode at a time as a `dm_control.rl.control.Environment`: what scores are made with."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import OrderedDict
+from typing import Any
+
+import dm_env.specs
+import numpy as np
+from dm_control import mujoco as dm_mujoco
+from dm_control.mujoco.wrapper import MjModel
+from dm_control.rl import control
+
+from tsbench.mdp import MDP, Array, Readings, State, Task
+from tsbench.sim.kinematic import Planning
+from tsbench.sim.model import sensor_slices
+
+ROW = np.array([0])  # the batch of one that every state here is
+
+
+class Adapter(control.Task):
+    """An MDP as dm_control steps it.
+
+    Attributes:
+        mdp: a task or a variant of one.
+        state: the current one, with a batch axis of length one.
+    """
+
+    def __init__(self, mdp: MDP[Any], rng: np.random.Generator) -> None:
+        self.mdp = mdp
+        self.rng = rng
+        self.state: State
+        self._previous: State
+        self._action: Array
+        self._steps = 0
+
+    @abstractmethod
+    def begin(self, physics: dm_mujoco.Physics) -> None:
+        """Sets `state` and the physics to the start of an episode."""
+
+    def initialize_episode(self, physics: dm_mujoco.Physics) -> None:
+        self.begin(physics)
+        self._steps = round(float(self.state.time[0]) / self.mdp.timestep)
+
+    def before_step(self, action: np.ndarray, physics: dm_mujoco.Physics) -> None:
+        self._previous = self.state
+        self._action = np.asarray(action, float)[None]
+        self._steps += 1
+
+    def get_observation(self, physics: dm_mujoco.Physics) -> OrderedDict[str, np.ndarray]:
+        return OrderedDict({control.FLAT_OBSERVATION_KEY: self.mdp.observation(self.state)[0]})
+
+    def get_reward(self, physics: dm_mujoco.Physics) -> float:
+        return float(self.mdp.reward(self._previous, self._action, self.state)[0])
+
+    def get_termination(self, physics: dm_mujoco.Physics) -> float | None:
+        """The discount of an episode that ends: 0 at a terminal state, 1 at the last step."""
+        if self.mdp.terminal(self.state)[0]:
+            return 0.0
+        return 1.0 if self._steps >= self.mdp.horizon else None
+
+    def action_spec(self, physics: dm_mujoco.Physics) -> dm_env.specs.BoundedArray:
+        return dm_env.specs.BoundedArray(
+            (self.mdp.action_size,), np.float64, minimum=-1.0, maximum=1.0, name="action"
+        )
+
+    def observation_spec(self, physics: dm_mujoco.Physics) -> OrderedDict[str, dm_env.specs.Array]:
+        name = control.FLAT_OBSERVATION_KEY
+        spec = dm_env.specs.Array((self.mdp.observation_size,), np.float64, name=name)
+        return OrderedDict({name: spec})
+
+
+class PhysicsAdapter(Adapter):
+    """A task, or its imitation variant, in full physics."""
+
+    def __init__(self, task: Task[Any], rng: np.random.Generator, perturbed: bool) -> None:
+        super().__init__(task, rng)
+        self.task = task
+        self.perturbed = perturbed
+
+    def begin(self, physics: dm_mujoco.Physics) -> None:
+        start = self.task.start(self.rng, 1, perturbed=self.perturbed)
+        physics.data.qpos[:] = start.qpos[0]
+        physics.data.qvel[:] = start.qvel[0]
+        physics.forward()
+        self._read(physics, start.time, start.memory)
+
+    def before_step(self, action: np.ndarray, physics: dm_mujoco.Physics) -> None:
+        super().before_step(action, physics)
+        ctrl, self._memory = self.task.control(self.state, self._action)
+        physics.set_control(ctrl[0])
+
+    def after_step(self, physics: dm_mujoco.Physics) -> None:
+        self._read(physics, self.state.time + self.task.timestep, self._memory)
+
+    def _read(self, physics: dm_mujoco.Physics, time: np.ndarray, memory: np.ndarray) -> None:
+        data = physics.data
+        sensors = sensor_slices(physics.model.ptr)
+        self.state = self.task.read(
+            Readings(
+                time=time,
+                qpos=data.qpos[None].copy(),
+                qvel=data.qvel[None].copy(),
+                sensors={
+                    name: data.sensordata[part][None].copy() for name, part in sensors.items()
+                },
+                memory=memory,
+            )
+        )
+
+
+class PlanningAdapter(Adapter):
+    """A planning variant, in which inverse kinematics gives every abstract state a full pose."""
+
+    def __init__(self, planning: Planning[Any], rng: np.random.Generator) -> None:
+        super().__init__(planning, rng)
+        self.planning = planning
+
+    def begin(self, physics: dm_mujoco.Physics) -> None:
+        self.state = self.planning.begin(self.rng, ROW)
+        self._pose(physics)
+
+    def after_step(self, physics: dm_mujoco.Physics) -> None:
+        self.state = self.planning.advance(self.state, self._action)
+        self._pose(physics)
+
+    def _pose(self, physics: dm_mujoco.Physics) -> None:
+        abstraction = self.planning.abstraction
+        physics.data.qpos[:] = abstraction.poses(abstraction.flatten(self.state))[0]
+        physics.data.qvel[:] = 0.0
+        physics.data.time = float(self.state.time[0])
+        physics.forward()
+
+
+class StillPhysics(dm_mujoco.Physics):
+    """A physics whose poses are set and never integrated.
+
+    Attributes:
+        plan_timestep: seconds between two of them.
+    """
+
+    plan_timestep: float
+
+    def step(self, nstep: int = 1) -> None:
+        pass
+
+    def timestep(self) -> float:
+        return self.plan_timestep
+
+
+def environment(
+    mdp: Task[Any] | Planning[Any], seed: int | None = None, *, perturbed: bool = False
+) -> control.Environment:
+    """One environment of a task or of its planning or imitation variant."""
+    rng = np.random.default_rng(seed)
+    if isinstance(mdp, Planning):
+        physics = StillPhysics.from_model(MjModel(mdp.task.spec().compile()))
+        physics.plan_timestep = mdp.timestep
+        return control.Environment(physics, PlanningAdapter(mdp, rng), n_sub_steps=1)
+    physics = dm_mujoco.Physics.from_model(MjModel(mdp.spec().compile()))
+    return control.Environment(
+        physics, PhysicsAdapter(mdp, rng, perturbed), n_sub_steps=mdp.substeps
+    )
