@@ -1,0 +1,1 @@
+"""Reinforcement learning by rsl-rl: the only room that imports torch."""

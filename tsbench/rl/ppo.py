@@ -1,0 +1,217 @@
+"""Proximal policy optimisation by rsl-rl, and the artefact it leaves behind.
+
+rsl-rl's `PPO`, models and storage do the learning. Its runner is not used: it prints a page per
+iteration, stores the enclosing repository's diff and changes the configuration it is given.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+
+from tsbench.mdp import Task
+from tsbench.policy import ACTIVATIONS, Policy, PolicyInfo
+from tsbench.rl.vec_env import TorchEnvironment
+from tsbench.sim.batched import BatchedEnvironment
+from tsbench.sim.model import fingerprint
+
+Report = Callable[[int, Mapping[str, float]], None]  # (environment steps so far, metrics)
+
+
+@dataclass(frozen=True)
+class PPOSettings:
+    """Attributes:
+    environments: episodes stepped together.
+    rollout: steps of each between two updates.
+    epochs: passes over the collected steps in an update.
+    minibatches: per pass.
+    discount: gamma.
+    gae_lambda: of generalised advantage estimation.
+    clip: range of the probability ratio.
+    clip_value: whether the value loss is clipped too.
+    entropy: weight of the entropy bonus.
+    learning_rate: at first.
+    desired_kl: that the learning rate is adapted to after every minibatch, or None to keep it.
+    value_weight: of the value loss.
+    gradient_norm: that gradients are clipped to.
+    hidden: sizes of the hidden layers of actor and critic.
+    activation: between the layers.
+    initial_std: of the Gaussian policy, per unit of action.
+    bootstrap: whether an episode's last step counts as if it went on.
+    """
+
+    environments: int = 512
+    rollout: int = 24
+    epochs: int = 5
+    minibatches: int = 4
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    clip_value: bool = False
+    entropy: float = 0.0
+    learning_rate: float = 1e-3
+    desired_kl: float | None = 0.01
+    value_weight: float = 1.0
+    gradient_norm: float = 1.0
+    hidden: tuple[int, ...] = (256, 128)
+    activation: str = "elu"
+    initial_std: float = 1.0
+    bootstrap: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("environments", "rollout", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name in ("learning_rate", "gradient_norm", "initial_std"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        for name in ("discount", "gae_lambda"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"hidden must be sizes of at least 1, not {self.hidden}")
+        if self.minibatches > self.environments * self.rollout:
+            raise ValueError(f"minibatches are {self.minibatches}, more than the steps collected")
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}")
+
+
+class Learner:
+    """An actor and a critic that learn in one environment.
+
+    Attributes:
+        steps: environment steps taken.
+    """
+
+    def __init__(
+        self,
+        environment: BatchedEnvironment[Any],
+        settings: PPOSettings,
+        seed: int,
+        actor_from: Learner | None = None,
+    ) -> None:
+        """`actor_from` lends its actor, normalisers and all, to go on from; the critic, whose
+        values belong to another reward, starts anew but for its normaliser."""
+        torch.manual_seed(seed)
+        self.settings = settings
+        self.environment = environment
+        self._env = TorchEnvironment(environment)
+        self.steps = 0
+        self._returns: deque[float] = deque(maxlen=100)
+        self._lengths: deque[int] = deque(maxlen=100)
+        self._return = np.zeros(environment.count)
+        self._length = np.zeros(environment.count, int)
+        self._ppo = self._build()
+        if actor_from is not None:
+            self._ppo.actor.load_state_dict(actor_from._ppo.actor.state_dict())
+            self._ppo.critic.obs_normalizer.load_state_dict(
+                actor_from._ppo.critic.obs_normalizer.state_dict()
+            )
+            with torch.no_grad():
+                self._ppo.actor.distribution.std_param.fill_(settings.initial_std)
+
+    def _build(self) -> PPO:
+        s, env = self.settings, self._env
+        observation = env.get_observations()
+        groups = {"actor": ["policy"], "critic": ["value"]}
+        shared = {
+            "hidden_dims": list(s.hidden), "activation": s.activation, "obs_normalization": True,
+        }  # fmt: skip
+        actor = MLPModel(
+            observation, groups, "actor", env.num_actions, **shared,
+            distribution_cfg={"class_name": "GaussianDistribution", "init_std": s.initial_std},
+        )  # fmt: skip
+        with torch.no_grad():  # at first every mean action is nearly zero: the nominal pose
+            actor.mlp[-1].weight.mul_(0.01)
+            actor.mlp[-1].bias.zero_()
+        critic = MLPModel(observation, groups, "critic", 1, **shared)
+        storage = RolloutStorage("rl", env.num_envs, s.rollout, observation, [env.num_actions])
+        return PPO(
+            actor,
+            critic,
+            storage,
+            num_learning_epochs=s.epochs,
+            num_mini_batches=s.minibatches,
+            clip_param=s.clip,
+            gamma=s.discount,
+            lam=s.gae_lambda,
+            value_loss_coef=s.value_weight,
+            entropy_coef=s.entropy,
+            learning_rate=s.learning_rate,
+            max_grad_norm=s.gradient_norm,
+            use_clipped_value_loss=s.clip_value,
+            schedule="fixed" if s.desired_kl is None else "adaptive",
+            desired_kl=s.desired_kl,
+        )
+
+    def learn(self, steps: int, report: Report | None = None) -> None:
+        """At least `steps` environment steps, in whole iterations."""
+        ppo, env = self._ppo, self._env
+        ppo.train_mode()
+        observation = env.get_observations()
+        end = self.steps + steps
+        while self.steps < end:
+            started = time.perf_counter()
+            with torch.inference_mode():
+                for _ in range(self.settings.rollout):
+                    actions = ppo.act(observation)
+                    observation, rewards, dones, extras = env.step(actions)
+                    self._count(rewards, dones)
+                    ppo.process_env_step(
+                        observation, rewards, dones, extras if self.settings.bootstrap else {}
+                    )
+                ppo.compute_returns(observation)
+            collected = time.perf_counter()
+            losses = ppo.update()
+            self.steps += env.num_envs * self.settings.rollout
+            if report is not None:
+                metrics = {
+                    "collect_seconds": collected - started,
+                    "update_seconds": time.perf_counter() - collected,
+                    "value_loss": losses["value"],
+                    "learning_rate": ppo.learning_rate,
+                    "std": ppo.actor.output_std.mean().item(),
+                }
+                if self._returns:
+                    metrics["episode_return"] = float(np.mean(self._returns))
+                    metrics["episode_length"] = float(np.mean(self._lengths))
+                report(self.steps, metrics)
+
+    def _count(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
+        self._return += rewards.numpy()
+        self._length += 1
+        ended = np.flatnonzero(dones.numpy())
+        self._returns.extend(self._return[ended].tolist())
+        self._lengths.extend(self._length[ended].tolist())
+        self._return[ended] = 0.0
+        self._length[ended] = 0
+
+    def policy(self, task: Task[Any], method: str) -> Policy:
+        """What has been learned for the task, as an artefact."""
+        actor = self._ppo.actor
+        linear = [module for module in actor.mlp if isinstance(module, torch.nn.Linear)]
+        weights = tuple(layer.weight.detach().numpy().copy() for layer in linear)
+        normaliser = actor.obs_normalizer
+        return Policy(
+            info=PolicyInfo(
+                task=task.name,
+                task_version=task.version,
+                physics=fingerprint(task.spec()),
+                method=method,
+                activation=self.settings.activation,
+                layers=(weights[0].shape[1], *(weight.shape[0] for weight in weights)),
+            ),
+            mean=normaliser.mean.numpy().copy(),
+            scale=(normaliser.std + normaliser.eps).numpy().copy(),
+            weights=weights,
+            biases=tuple(layer.bias.detach().numpy().copy() for layer in linear),
+        )

@@ -1,0 +1,80 @@
+"""The stages that methods are made of: PPO on a task, on its imitation, on its planning variant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tsbench.errors import TsbenchError, unknown
+from tsbench.mdp import Task
+from tsbench.problem import Problem, Workspace
+from tsbench.rl.ppo import Learner, PPOSettings
+from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.kinematic import Planning
+from tsbench.typed import typed_items
+
+KINDS = ("plan", "imitate", "task", "finetune")
+
+
+def settings(problem: Problem, kind: str) -> PPOSettings:
+    """The PPO settings of a kind of stage. Those of `finetune`, which goes on with the imitation
+    stage's policy, are changes to those of `imitate`.
+
+    Raises:
+        TsbenchError: unknown names or values of the wrong type or range.
+    """
+    if kind not in KINDS:
+        raise unknown("kind of stage", f"task.training.{kind}", KINDS)
+    changes: dict[str, Any] = {}
+    for name in ("imitate", "finetune") if kind == "finetune" else (kind,):
+        given = problem.training.get(name, {})
+        changes |= typed_items(PPOSettings, given, f"task.training.{name}")
+    if problem.budget.environments is not None:
+        changes["environments"] = problem.budget.environments
+    try:
+        return PPOSettings(**changes)
+    except ValueError as error:
+        raise TsbenchError(f"task.training.{kind}.{error}") from None
+
+
+def learn_planning(
+    problem: Problem, workspace: Workspace, steps: int, explore: float = 0.0
+) -> Learner:
+    """PPO on the planning variant; `explore` as in `Planning`, for the first half of the steps.
+
+    Sampled states show what pays near the goal before the way there is known; starts from the
+    task's own start then give that way its due.
+    """
+    chosen = settings(problem, "plan")
+    planning: Planning[Any] = Planning(problem.task, explore=explore)
+    environment = BatchedEnvironment(planning, planning, chosen.environments, problem.seed)
+    with workspace.stage("plan", steps) as monitor:
+        learner = Learner(environment, chosen, problem.seed)
+        learner.learn(steps // 2, monitor.update)
+        planning.explore = 0.0
+        learner.learn(steps - learner.steps, monitor.update)
+    return learner
+
+
+def learn_physics(
+    problem: Problem,
+    workspace: Workspace,
+    name: str,
+    task: Task[Any],
+    kind: str,
+    steps: int,
+    start_from: Learner | None = None,
+) -> Learner:
+    """PPO on a task in full physics, or on its imitation variant."""
+    chosen = settings(problem, kind)
+    physics: Physics[Any] = Physics(task, chosen.environments, threads=problem.threads)
+    environment = BatchedEnvironment(task, physics, chosen.environments, problem.seed)
+    with workspace.stage(name, steps) as monitor:
+
+        def report(done: int, metrics: Mapping[str, float]) -> None:
+            monitor.physics_substeps = physics.substeps
+            monitor.update(done, metrics)
+
+        learner = Learner(environment, chosen, problem.seed, start_from)
+        learner.learn(steps, report)
+    return learner

@@ -1,0 +1,55 @@
+"""A batched environment as rsl-rl wants it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from tsbench.sim.batched import BatchedEnvironment
+
+
+class TorchEnvironment(VecEnv):
+    """Float32 tensors on the CPU over a batched environment.
+
+    Attributes:
+        cfg: nothing; rsl-rl asks for it.
+    """
+
+    def __init__(self, environment: BatchedEnvironment[Any]) -> None:
+        mdp = environment.mdp
+        self.environment = environment
+        self.num_envs = environment.count
+        self.num_actions = mdp.action_size
+        self.max_episode_length = mdp.horizon
+        self.device = "cpu"
+        self.cfg: dict[str, Any] = {}
+        self._observation = self._tensors(environment.reset())
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        return torch.from_numpy(self.environment.steps)
+
+    def get_observations(self) -> TensorDict:
+        return self._observation
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Extras: `time_outs`, whether an episode ended with its last step, shape (num_envs,)."""
+        transition = self.environment.step(actions.numpy().astype("float64"))
+        self._observation = self._tensors(transition.observation)
+        time_outs = torch.from_numpy(transition.truncated)
+        dones = torch.from_numpy(transition.terminal) | time_outs
+        rewards = torch.from_numpy(transition.reward).float()
+        return self._observation, rewards, dones.long(), {"time_outs": time_outs.float()}
+
+    def _tensors(self, observation: np.ndarray) -> TensorDict:
+        environment = self.environment
+        value = environment.mdp.value_observation(environment.state)
+        groups = {"policy": observation, "value": value}
+        tensors = {name: torch.from_numpy(group).float() for name, group in groups.items()}
+        return TensorDict(tensors, batch_size=[self.num_envs])
