@@ -1,0 +1,1 @@
+"""Seeing a motion: MuJoCo models in meshcat, and pages that anyone can open."""
