@@ -1,0 +1,258 @@
+"""The command line: a table of verbs, each of which imports what it needs when it is used."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from tsbench.errors import TsbenchError, unknown
+
+RUN_HELP = """\
+usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
+
+Trains a policy, evaluates it on the original task and leaves a run directory that explains itself.
+
+words, in Hydra's grammar:
+  task=NAME        what to solve; `tsbench list` names them
+  method=NAME      what solves it (twostage)
+  budget=NAME      smoke: seconds, fast: the standard, paper: the published one (fast)
+  seed=N           everything random comes from it (0)
+  directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
+  threads=N        CPU threads (all)
+  method.KEY=...   an option of the method
+  task.training.STAGE.KEY=... (with a + before it where the YAML has no such key)
+                   a PPO setting of the plan, imitate or task stages
+
+options:
+  --cfg job        show the configuration and stop
+  -m, --multirun   a sweep: every combination of the values given, e.g. seed=0,1,2 task=a,b
+  --hydra-help     Hydra's own flags; -sc install=bash prints the shell completion
+
+examples:
+  tsbench run task=rocket_navigation budget=smoke
+  tsbench run -m task=laikago_walk,laikago_trot 'seed=range(0,3)'
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise TsbenchError(f"{message} (see {self.prog} --help)")
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A command: what it does in a few words, and the function that takes its arguments."""
+
+    summary: str
+    call: Callable[[Sequence[str]], None]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command and returns the exit status: 0, 2 for a user's mistake, 130 for Ctrl-C."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        _dispatch(words)
+    except TsbenchError as error:
+        sys.stderr.write(f"tsbench: {error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("tsbench: interrupted\n")
+        return 130
+    except BrokenPipeError:  # the reader of the output has left: `tsbench list | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    return 0
+
+
+def _dispatch(words: list[str]) -> None:
+    if not words or words[0] in ("-h", "--help", "help"):
+        sys.stdout.write(_help())
+    elif words[0] == "--version":
+        sys.stdout.write(f"tsbench {version('tsbench')}\n")
+    elif words[0] in ("-sc", "--shell-completion"):
+        _complete(words)
+    elif words[0] in VERBS:
+        VERBS[words[0]].call(words[1:])
+    else:
+        raise unknown("command", words[0], VERBS)
+
+
+def _help() -> str:
+    verbs = "\n".join(f"  {name:<10}{verb.summary}" for name, verb in VERBS.items())
+    return f"""\
+usage: tsbench COMMAND ...
+
+Sparse-reward robot tasks, as a planning MDP and as a physics MDP, and the methods that solve them.
+
+commands (each with --help):
+{verbs}
+
+first steps:
+  tsbench list
+  tsbench run task=rocket_navigation budget=smoke
+"""
+
+
+def _run(words: Sequence[str]) -> None:
+    if "-h" in words or "--help" in words:
+        sys.stdout.write(RUN_HELP)
+        return
+    from tsbench import launch
+
+    launch.launch(words)
+
+
+def _complete(words: Sequence[str]) -> None:
+    """Shell completion: Hydra's, which knows nothing of verbs, with the verb taken out."""
+    line = os.environ.get("COMP_LINE", "").split(" ")
+    if "install" not in words[-1] and (len(line) < 3 or line[1] != "run"):
+        sys.stdout.write(" ".join(VERBS) + "\n")
+        return
+    os.environ["COMP_LINE"] = " ".join(line[:1] + line[2:])
+    from tsbench import launch
+
+    launch.launch(words)
+
+
+def _list(words: Sequence[str]) -> None:
+    parser = _parser("list")
+    options = parser.parse_args(words)
+    from tsbench import config, methods, tasks
+
+    made = {name: tasks.make(name) for name in tasks.names()}
+    budgets = {name: config.compose([f"task={name}"]).task.budgets for name in config.names("task")}
+    rows = {
+        name: {
+            "version": task.version,
+            "steps": task.horizon,
+            "seconds": round(task.horizon * task.timestep, 6),
+            "budgets": {budget: vars(steps) for budget, steps in budgets[name].items()},
+        }
+        for name, task in made.items()
+    }
+    summaries = {name: methods.summary(name) for name in methods.names()}
+    _write_json(options.json, {"tasks": rows, "methods": summaries})
+    offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for header in ("task", "version", "seconds", *offered):
+        table.add_column(header, no_wrap=True)
+    for name, row in rows.items():
+        amounts = [budgets[name].get(budget) for budget in offered]
+        costs = [f"{_short(a.plan)} + {_short(a.act)}" if a else "-" for a in amounts]
+        table.add_row(name, str(row["version"]), f"{row['seconds']:g}", *costs)
+    console = Console()
+    console.print(table)
+    console.print("Budgets: environment steps to plan with + to act with.")
+    table = Table("method", "what it does", box=SIMPLE_HEAD, pad_edge=False)
+    for name, summary in summaries.items():
+        table.add_row(name, summary)
+    console.print(table)
+
+
+def _short(steps: int) -> str:
+    """Thousands as k, millions as M, to three digits."""
+    for size, letter in ((1_000_000, "M"), (1_000, "k")):
+        if steps >= size:
+            return f"{steps / size:.3g}{letter}"
+    return str(steps)
+
+
+def _parser(verb: str, *, json: bool = True) -> Parser:
+    summary = VERBS[verb].summary
+    parser = Parser(f"tsbench {verb}", description=summary, allow_abbrev=False)
+    if json:
+        what = "write what is shown to a new JSON file too"
+        parser.add_argument("--json", type=Path, metavar="FILE", help=what)
+    return parser
+
+
+def _write_json(path: Path | None, content: Any) -> None:
+    if path is not None:
+        from tsbench.record import write_json
+
+        write_json(path, content)
+
+
+def _evaluate(words: Sequence[str]) -> None:
+    parser = _parser("evaluate")
+    parser.add_argument("run", type=Path, metavar="RUN", help="directory with a policy in it")
+    parser.add_argument("--episodes", type=_episodes, metavar="N", help="perturbed starts (100)")
+    parser.add_argument("--seed", type=_seed, metavar="N", help="of the perturbed starts (0)")
+    options = parser.parse_args(words)
+    from tsbench import record, tables
+    from tsbench.evaluation.evaluate import evaluate
+
+    chosen = {name: getattr(options, name) for name in ("episodes", "seed")}
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    policy, task = record.read_policy(options.run)
+    score = evaluate(policy, task, **chosen).as_dict()
+    _write_json(options.json, score)
+    console = Console()
+    console.print(tables.score_table(f"{task.name}: {options.run}", score))
+    if not chosen and (options.run / record.SCORE).exists():
+        same = score == record.read_score(options.run)["score"]
+        verdict = "equal to" if same else "DIFFERENT from"
+        console.print(f" {verdict} {options.run / record.SCORE}", highlight=False, soft_wrap=True)
+
+
+def _episodes(word: str) -> int:
+    return _whole_number(word, 1, 1_000_000)
+
+
+def _seed(word: str) -> int:
+    return _whole_number(word, 0, 2**32 - 1)
+
+
+def _whole_number(word: str, lowest: int, highest: int) -> int:
+    if not (word.isdecimal() and lowest <= int(word) <= highest):
+        message = f"must be a whole number from {lowest} to {highest}, not {word!r}"
+        raise argparse.ArgumentTypeError(message)
+    return int(word)
+
+
+def _view(words: Sequence[str]) -> None:
+    parser = _parser("view", json=False)
+    parser.add_argument("run", type=Path, metavar="RUN", help="directory with a policy in it")
+    parser.add_argument("--html", type=Path, metavar="FILE", required=True, help="a new page")
+    options = parser.parse_args(words)
+    from tsbench import record, tables
+    from tsbench.motion import ReferenceMotion
+    from tsbench.viewer.run_page import write_run_page
+
+    policy, task = record.read_policy(options.run)
+    reference = options.run / record.REFERENCE
+    finished = (options.run / record.SCORE).exists()
+    score = record.read_score(options.run) if finished else None
+    write_run_page(
+        options.html,
+        task,
+        policy,
+        ReferenceMotion.load(reference) if reference.exists() else None,
+        title=tables.run_title(score) if score else task.name,
+        summary=tables.summary(score) if score else [],
+    )
+    sys.stdout.write(f"{options.html}\n")
+
+
+VERBS = {
+    "run": Verb("train a policy and evaluate it", _run),
+    "evaluate": Verb("score a policy from its file alone", _evaluate),
+    "view": Verb("write a page that plays a run's motion", _view),
+    "list": Verb("name the tasks, methods and budgets", _list),
+}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""Learning curves of a run, drawn from its `metrics.jsonl`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+MEASURE = "episode_return"
+
+
+def draw(metrics: Path, picture: Path) -> None:
+    """Draws the return against environment steps, one panel for each stage.
+
+    Args:
+        metrics: a run's `metrics.jsonl`; without returns in it nothing is drawn.
+        picture: the PNG to write.
+    """
+    curves: dict[str, tuple[list[int], list[float]]] = {}
+    for line in metrics.read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        if MEASURE in row:
+            steps, returns = curves.setdefault(row["stage"], ([], []))
+            steps.append(row["steps"])
+            returns.append(row[MEASURE])
+    if not curves:
+        return
+    figure = Figure(figsize=(4.5 * len(curves), 3.2), layout="constrained")
+    panels = figure.subplots(1, len(curves), squeeze=False)[0]
+    for panel, (stage, (steps, returns)) in zip(panels, curves.items(), strict=True):
+        panel.plot(steps, returns)
+        panel.set(title=stage, xlabel="environment steps", ylabel="episode return of the stage")
+        panel.grid(alpha=0.3)
+    figure.savefig(picture, dpi=120)

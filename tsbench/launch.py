@@ -1,0 +1,88 @@
+"""From the words of `tsbench run` to jobs: one run or a sweep, handed over to Hydra."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NoReturn
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from tsbench import config, run
+from tsbench.config import RunConfig
+from tsbench.errors import TsbenchError
+
+RUNS = Path("runs")
+CHECKED_JOBS = 1000  # of a sweep; later ones are checked when their turn comes
+PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads")
+OWN_SEARCH_PATH = ("config_path", "config_name", "config_dir", "experimental_rerun")
+NO_JOB = ("shell_completion", "hydra_help", "info")
+
+
+def launch(words: Sequence[str]) -> None:
+    """Does what `tsbench run WORDS` asks for; every job is checked before the first one starts.
+
+    Raises:
+        TsbenchError: the words are wrong, or runs failed. The other runs of a sweep go on.
+    """
+    parser = get_args_parser()
+    parser.error = _refuse
+    flags = parser.parse_intermixed_args(list(words))
+    if not any(getattr(flags, name) for name in (*OWN_SEARCH_PATH, *NO_JOB)):
+        jobs = config.sweep(flags.overrides) if flags.multirun else [list(flags.overrides)]
+        for job in islice(jobs, CHECKED_JOBS):
+            run.prepare(config.compose(job))
+
+    failures: list[TsbenchError] = []
+    parent = os.getpid()
+
+    @hydra.main(
+        version_base=config.VERSION_BASE,
+        config_path=f"pkg://{config.CONFIGURATIONS}",
+        config_name="config",
+    )
+    def start(node: DictConfig) -> float:
+        given = list(HydraConfig.get().overrides.task)
+        chosen = config.parse(node)
+        chosen = replace(chosen, directory=chosen.directory or str(directory(chosen, given)))
+        try:
+            return run.execute(chosen, given).normalized_reward
+        except TsbenchError as error:
+            if os.getpid() != parent:  # a launcher's worker: the failure has to travel back
+                raise
+            failures.append(error)
+            if flags.multirun:
+                sys.stderr.write(f"tsbench: {chosen.directory}: {error}\n")
+            return float("nan")
+
+    options = [word for word in words if word not in flags.overrides]
+    sys.argv = [sys.argv[0], *options, *config.opened(flags.overrides)]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra lets exceptions through instead of printing them
+    with config.one_line_errors():
+        start()
+    if len(failures) == 1 and not flags.multirun:
+        raise failures[0]
+    if failures:
+        raise TsbenchError(f"{len(failures)} of the sweep's runs failed (see above)")
+
+
+def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
+    """The standard run directory; words that are not part of its name are added to it."""
+    name = f"seed{chosen.seed}-{chosen.budget}"
+    for word in words:
+        key = word.lstrip("+~").split("=")[0]
+        if key not in PART_OF_THE_NAME:
+            name += "," + re.sub(r"[^\w.=-]+", "_", word.lstrip("+~"))
+    return RUNS / chosen.task.name / str(chosen.method["name"]) / name
+
+
+def _refuse(message: str) -> NoReturn:
+    raise TsbenchError(f"{message} (see tsbench run --help)")

@@ -1,0 +1,95 @@
+"""What lies in a run directory, and how to read it back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tsbench import tasks
+from tsbench.config import RunConfig
+from tsbench.errors import TsbenchError, os_errors
+from tsbench.mdp import Task
+from tsbench.policy import Policy
+from tsbench.typed import typed
+
+CONFIG = "config.yaml"
+VERSIONS = "versions.json"
+METRICS = "metrics.jsonl"
+LOG = "log.txt"
+EVENTS = "tensorboard"
+PLAN = "plan.npz"
+REFERENCE = "reference.npz"
+SCORE = "score.json"
+CURVES = "learning_curves.png"
+PAGE = "view.html"
+
+
+def read_config(directory: Path) -> RunConfig:
+    """The configuration that a run was made with.
+
+    Raises:
+        TsbenchError: the file is missing, damaged, or no configuration of this tsbench.
+    """
+    path = directory / CONFIG
+    try:
+        with os_errors(path):
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        config: RunConfig = typed(RunConfig, content, "")
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise TsbenchError(f"damaged configuration {path}: {reason}") from None
+    except TsbenchError as error:
+        raise TsbenchError(f"damaged configuration {path}: {error}") from None
+    return config
+
+
+def read_score(directory: Path) -> dict[str, Any]:
+    """The content of a finished run's `score.json`.
+
+    Raises:
+        TsbenchError: the file is missing or damaged.
+    """
+    path = directory / SCORE
+    with os_errors(path):
+        content = path.read_bytes()
+    try:
+        record = json.loads(content)
+        if not isinstance(record["score"], dict):
+            raise ValueError("no score in it")
+    except (ValueError, KeyError, TypeError) as error:
+        raise TsbenchError(f"damaged score {path}: {error}") from None
+    return dict(record)
+
+
+def read_policy(directory: Path) -> tuple[Policy, Task[Any]]:
+    """A run's policy and the task that it solves, with the constants that it was trained for.
+
+    A directory with nothing but the policy's two files will do; the task is then the standard one.
+
+    Raises:
+        TsbenchError: there is no such directory, or a file in it is damaged.
+    """
+    if not directory.is_dir():
+        raise TsbenchError(f"no run directory {directory}")
+    policy = Policy.load(directory)
+    constants = {}
+    if (directory / CONFIG).exists():
+        constants = read_config(directory).task.constants
+    return policy, tasks.make(policy.info.task, **constants)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes a JSON file; nothing is overwritten.
+
+    Raises:
+        TsbenchError: the file exists or cannot be written.
+    """
+    with os_errors(path):
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(json.dumps(content, indent=2) + "\n")
+        except FileExistsError:
+            raise TsbenchError(f"{path} exists and nothing is overwritten") from None

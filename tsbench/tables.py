@@ -1,0 +1,85 @@
+"""Results as the user sees them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from tsbench.record import CURVES, PAGE
+
+
+def duration(seconds: float) -> str:
+    """h:mm:ss, or m:ss below an hour."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def number(value: Any) -> str:
+    """Four digits of a fraction; a dash for what is not known."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def score_table(title: str, score: Mapping[str, Any]) -> Table:
+    """A score: the task's own start beside the perturbed ones.
+
+    Args:
+        title: what was scored.
+        score: `Score.as_dict()`.
+    """
+    nominal, perturbed = score["nominal"], score["perturbed"]
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("")
+    table.add_column("task's own start", justify="right")
+    table.add_column(f"{perturbed['episodes']} perturbed starts", justify="right")
+    table.add_row(
+        "normalized_reward",
+        number(score["normalized_reward"]),
+        number(perturbed["normalized_reward"]),
+    )
+    table.add_row("optimality", number(score["optimality"]))
+    for name in nominal:
+        if name not in ("episodes", "normalized_reward"):
+            table.add_row(name, number(nominal[name]), number(perturbed[name]))
+    return table
+
+
+def show_run(console: Console, record: Mapping[str, Any], directory: Path) -> None:
+    """Prints what ends a run: its score, what each stage cost, and where to look next.
+
+    Args:
+        console: to print on.
+        record: the content of `score.json`.
+        directory: of the run.
+    """
+    table = score_table(run_title(record), record["score"])
+    table.add_section()
+    table.add_row("stage", "steps", "time", style="bold")
+    for stage in record["stages"]:
+        table.add_row(stage["name"], f"{stage['steps']:,}", duration(stage["seconds"]))
+    console.print(table)
+    for what, where in (
+        ("see it move", directory / PAGE),
+        ("how it learned", directory / CURVES),
+        ("score it again", f"tsbench evaluate {directory}"),
+    ):
+        console.print(f" {what:<17} {where}", markup=False, highlight=False, soft_wrap=True)
+
+
+def run_title(record: Mapping[str, Any]) -> str:
+    return "{task}, {method}, seed {seed}, budget {budget}".format(**record)
+
+
+def summary(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Labels and values of a run's score in short."""
+    score = record["score"]
+    names = ("normalized_reward", "optimality", "success")
+    return [(name, number(score[name])) for name in names]
