@@ -30,8 +30,10 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   method.KEY=...   an option of the method
-  task.training.STAGE.KEY=... (with a + before it where the YAML has no such key)
-                   a PPO setting of the plan, imitate or task stages
+  task.training.STAGE.KEY=...
+                   a PPO setting of the plan, imitate, finetune or task stages
+  task.constants.KEY=...
+                   a constant of the task, for studies: such a score cannot be ranked
 
 options:
   --cfg job        show the configuration and stop
@@ -64,16 +66,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         _dispatch(words)
+        sys.stdout.flush()
     except TsbenchError as error:
-        sys.stderr.write(f"tsbench: {error}\n")
-        return 2
+        return _fail(str(error), 2)
     except KeyboardInterrupt:
-        sys.stderr.write("tsbench: interrupted\n")
-        return 130
+        return _fail("interrupted", 130)
     except BrokenPipeError:  # the reader of the output has left: `tsbench list | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 141
+    except OSError as error:  # a file that nobody took care of, or the output itself
+        _drop_output()
+        return _fail(f"{error.filename or 'output'}: {error.strerror or error}", 2)
     return 0
+
+
+def _fail(line: str, status: int) -> int:
+    sys.stderr.write(f"tsbench: {line}\n")
+    return status
+
+
+def _drop_output() -> None:
+    """What is still in the buffer has nowhere to go; Python would say so at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _dispatch(words: list[str]) -> None:
@@ -84,9 +98,20 @@ def _dispatch(words: list[str]) -> None:
     elif words[0] in ("-sc", "--shell-completion"):
         _complete(words)
     elif words[0] in VERBS:
+        _check_graphics()
         VERBS[words[0]].call(words[1:])
     else:
         raise unknown("command", words[0], VERBS)
+
+
+def _check_graphics() -> None:
+    """mujoco chooses OpenGL when it is imported, and fails if MUJOCO_GL names none that works."""
+    try:
+        import mujoco  # noqa: F401
+    except Exception as error:
+        setting = os.environ.get("MUJOCO_GL", "")
+        reason = str(error).partition("\n")[0]
+        raise TsbenchError(f"mujoco does not start with MUJOCO_GL={setting}: {reason}") from error
 
 
 def _help() -> str:
@@ -246,10 +271,25 @@ def _view(words: Sequence[str]) -> None:
     sys.stdout.write(f"{options.html}\n")
 
 
+def _bench(words: Sequence[str]) -> None:
+    parser = _parser("bench")
+    parser.add_argument("--only", metavar="NAME", help="one domain: laikago or rocket")
+    parser.add_argument("--quick", action="store_true", help="seconds instead of a minute")
+    options = parser.parse_args(words)
+    from dataclasses import asdict
+
+    from tsbench import bench, tables
+
+    result = bench.measure(only=options.only, quick=options.quick)
+    _write_json(options.json, asdict(result))
+    tables.show_bench(Console(), result)
+
+
 VERBS = {
     "run": Verb("train a policy and evaluate it", _run),
     "evaluate": Verb("score a policy from its file alone", _evaluate),
     "view": Verb("write a page that plays a run's motion", _view),
+    "bench": Verb("measure how fast episodes are stepped", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import sys
@@ -21,6 +22,7 @@ from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError
 
 RUNS = Path("runs")
+LONGEST_NAME = 200  # characters; file systems allow 255 bytes
 CHECKED_JOBS = 1000  # of a sweep; later ones are checked when their turn comes
 PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads")
 OWN_SEARCH_PATH = ("config_path", "config_name", "config_dir", "experimental_rerun")
@@ -60,7 +62,7 @@ def launch(words: Sequence[str]) -> None:
                 raise
             failures.append(error)
             if flags.multirun:
-                sys.stderr.write(f"tsbench: {chosen.directory}: {error}\n")
+                sys.stderr.write(f"tsbench: failed: {' '.join(given)}: {error}\n")
             return float("nan")
 
     options = [word for word in words if word not in flags.overrides]
@@ -81,6 +83,8 @@ def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
         key = word.lstrip("+~").split("=")[0]
         if key not in PART_OF_THE_NAME:
             name += "," + re.sub(r"[^\w.=-]+", "_", word.lstrip("+~"))
+    if len(name) > LONGEST_NAME:
+        name = name[:LONGEST_NAME] + "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
     return RUNS / chosen.task.name / str(chosen.method["name"]) / name
 
 

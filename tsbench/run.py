@@ -107,7 +107,6 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
         "score": score.as_dict(),
         "stages": workspace.stage_rows(),
     }
-    write_json(directory / SCORE, record)
     curves.draw(directory / METRICS, directory / CURVES)
     reference = directory / REFERENCE
     write_run_page(
@@ -118,6 +117,7 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
         title=tables.run_title(record),
         summary=tables.summary(record),
     )
+    write_json(directory / SCORE, record)  # last: its presence says that the run is finished
     tables.show_run(console, record, directory)
     return score
 
