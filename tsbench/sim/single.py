@@ -133,6 +133,14 @@ class PlanningAdapter(Adapter):
         physics.forward()
 
 
+class ExactPhysics(dm_mujoco.Physics):
+    """dm_control's physics, but for what follows a reset: dm_control computes the first state
+    with actuators disabled, which leaves zero velocities for their damping in the first step."""
+
+    def after_reset(self) -> None:
+        self.forward()
+
+
 class StillPhysics(dm_mujoco.Physics):
     """A physics whose poses are set and never integrated.
 
@@ -158,7 +166,7 @@ def environment(
         physics = StillPhysics.from_model(MjModel(mdp.task.spec().compile()))
         physics.plan_timestep = mdp.timestep
         return control.Environment(physics, PlanningAdapter(mdp, rng), n_sub_steps=1)
-    physics = dm_mujoco.Physics.from_model(MjModel(mdp.spec().compile()))
+    physics = ExactPhysics.from_model(MjModel(mdp.spec().compile()))
     return control.Environment(
         physics, PhysicsAdapter(mdp, rng, perturbed), n_sub_steps=mdp.substeps
     )
