@@ -39,12 +39,15 @@ class _Recording:
             raise TsbenchError(f"not a valid {self.kind}: {problem}")
 
     def _problem(self) -> str | None:
+        for name, kind in (("task", str), ("task_version", int), ("timestep", float)):
+            if type(getattr(self, name)) is not kind:
+                return f"{name} must be {kind.__name__}, not {getattr(self, name)!r}"
         if not (np.isfinite(self.timestep) and self.timestep > 0.0):
             return f"the time step is {self.timestep}, it must be positive"
         for name, ndim in self.time_axes.items():
             array = getattr(self, name)
-            if array.ndim != ndim:
-                return f"{name} has {array.ndim} dimensions, it must have {ndim}"
+            if not isinstance(array, np.ndarray) or array.ndim != ndim:
+                return f"{name} must be an array of {ndim} dimensions"
             if array.dtype != (bool if name == "contacts" else np.float64):
                 return f"{name} is of type {array.dtype}"
             if not np.all(np.isfinite(array)):

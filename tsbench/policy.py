@@ -128,6 +128,13 @@ class Policy:
         try:
             tensors = load(content)
             count = len(info.layers) - 1
+            expected_names = {"mean", "scale"}
+            expected_names |= {f"{kind}_{i}" for kind in ("weight", "bias") for i in range(count)}
+            if differing := sorted(set(tensors) ^ expected_names):
+                raise ValueError(f"missing or unknown tensors: {', '.join(differing)}")
+            for name, tensor in tensors.items():
+                if tensor.dtype != np.float32:
+                    raise ValueError(f"{name} is of type {tensor.dtype}, not float32")
             policy = cls(
                 info=info,
                 mean=tensors["mean"],

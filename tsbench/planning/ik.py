@@ -11,8 +11,7 @@ import numpy as np
 SOLVER = "daqp"
 TOLERANCE = 1e-4  # m: feet this close to their targets are there
 MAX_ITERATIONS = 50
-GAIN = 1.0  # full Gauss-Newton steps: mink divides them by the time step, we multiply it back
-DT = 1.0
+DT = 1.0  # s, nominal: mink divides a step by it, we multiply it back
 
 
 class FootPoses:
@@ -28,10 +27,11 @@ class FootPoses:
             feet: names of the sites at the foot centres.
             home: generalised positions that the first solution starts from, shape (nq,).
         """
+        self._home = home.copy()
+        self._feet = [model.site(foot).id for foot in feet]
         self._configuration = mink.Configuration(model, q=home.copy())
         self._tasks = [
-            mink.FrameTask(foot, "site", position_cost=1.0, orientation_cost=0.0, gain=GAIN)
-            for foot in feet
+            mink.FrameTask(foot, "site", position_cost=1.0, orientation_cost=0.0) for foot in feet
         ]
         self._freeze = [mink.DofFreezingTask(model, dof_indices=list(range(6)))]
         self._limits = [mink.ConfigurationLimit(model)]
@@ -48,18 +48,31 @@ class FootPoses:
             foot and its target in metres. It is the caller who judges that: joint limits always
             hold, so a target out of reach keeps a distance.
         """
-        q = self._configuration.q.copy()
-        q[:7] = base
+        q, residual = self._descend(self._configuration.q, base, feet)
+        if residual > TOLERANCE:  # a pose far off may be a dead end: once more from a good one
+            again, other = self._descend(self._home, base, feet)
+            if other < residual:
+                q, residual = again, other
         self._configuration.update(q)
+        return q, residual
+
+    def _descend(
+        self, first: np.ndarray, base: np.ndarray, feet: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """Gauss-Newton from the joint angles of `first`."""
+        configuration = self._configuration
+        q = first.copy()
+        q[:7] = base
+        configuration.update(q)
         for task, target in zip(self._tasks, feet, strict=True):
             task.set_target(mink.SE3.from_translation(target))
-        residual = self._residual()
+        residual = self._residual(feet)
         for _ in range(MAX_ITERATIONS):
             if residual < TOLERANCE:
                 break
             try:
                 velocity = mink.solve_ik(
-                    self._configuration,
+                    configuration,
                     self._tasks,
                     DT,
                     SOLVER,
@@ -69,16 +82,14 @@ class FootPoses:
                 )
             except mink.NoSolutionFound:
                 break
-            self._configuration.integrate_inplace(velocity, DT)
-            improved = self._residual()
+            configuration.integrate_inplace(velocity, DT)
+            improved = self._residual(feet)
             if improved > 0.999 * residual:  # as near as the limits let it come
                 residual = improved
                 break
             residual = improved
-        return self._configuration.q.copy(), residual
+        return configuration.q.copy(), residual
 
-    def _residual(self) -> float:
-        errors = [
-            np.linalg.norm(task.compute_error(self._configuration)[:3]) for task in self._tasks
-        ]
-        return float(max(errors))
+    def _residual(self, feet: np.ndarray) -> float:
+        found = self._configuration.data.site_xpos[self._feet]
+        return float(np.linalg.norm(found - feet, axis=-1).max())

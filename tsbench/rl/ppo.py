@@ -6,6 +6,7 @@ iteration, stores the enclosing repository's diff and changes the configuration 
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -71,9 +72,14 @@ class PPOSettings:
         for name in ("environments", "rollout", "epochs", "minibatches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("learning_rate", "gradient_norm", "initial_std"):
-            if not getattr(self, name) > 0.0:
+        for name in ("learning_rate", "gradient_norm", "initial_std", "clip"):
+            if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        for name in ("entropy", "value_weight"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
+        if self.desired_kl is not None and not 0.0 < self.desired_kl < math.inf:
+            raise ValueError(f"desired_kl must be positive or null, not {self.desired_kl}")
         for name in ("discount", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
