@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import cache
+
+# Before numpy and torch are loaded, here and in the commands that tests start: the tests run side
+# by side, and threads that wait for each other's cores slow a small network down tenfold.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest

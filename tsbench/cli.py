@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail("interrupted", 130)
     except BrokenPipeError:  # the reader of the output has left: `tsbench list | head -1`
         _drop_output()
-        return 141
+        return 1
     except OSError as error:  # a file that nobody took care of, or the output itself
         _drop_output()
         return _fail(f"{error.filename or 'output'}: {error.strerror or error}", 2)

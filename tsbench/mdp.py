@@ -17,6 +17,7 @@ from typing import Any, Generic, Self, TypeVar
 import mujoco
 import numpy as np
 
+from tsbench.errors import unknown
 from tsbench.motion import Audit, Plan, ReferenceMotion
 
 Array = Any  # an array of any library that follows the array API standard
@@ -190,6 +191,7 @@ class Task(MDP[S]):
     """An MDP in full physics, with a sparse reward."""
 
     substeps: int  # physics steps in one control step
+    imitation_forms: tuple[str, ...]  # tracking rewards on offer, the default first
 
     @abstractmethod
     def spec(self) -> mujoco.MjSpec:
@@ -235,6 +237,18 @@ class Task(MDP[S]):
     @abstractmethod
     def tracker(self, reference: ReferenceMotion, form: str | None = None) -> Tracker[S]:
         """The imitation variant's reward; `form` picks one of several where there are."""
+
+    def imitation_form(self, form: str | None) -> str:
+        """The tracking reward of that name, None for the default.
+
+        Raises:
+            TsbenchError: there is none of that name.
+        """
+        if form is None:
+            return self.imitation_forms[0]
+        if form not in self.imitation_forms:
+            raise unknown(f"imitation reward of {self.name}", form, self.imitation_forms)
+        return form
 
     def constants(self) -> dict[str, Any]:
         """The values that define the task; a score made with others cannot be ranked."""

@@ -43,6 +43,7 @@ class Options:
 def train(problem: Problem, workspace: Workspace) -> Policy:
     chosen: Options = options(Options, problem)
     task, budget = problem.task, problem.budget
+    form = task.imitation_form(chosen.imitation)
 
     planner = learn_planning(problem, workspace, budget.plan, chosen.explore)
     plan = extract(Planning(task), planner.policy(task, "twostage"))
@@ -56,7 +57,7 @@ def train(problem: Problem, workspace: Workspace) -> Policy:
     if audit.passed:
         workspace.note("plan audit: passed")
 
-    imitation = Imitation(task, reference, chosen.imitation)
+    imitation = Imitation(task, reference, form)
     finetuning = round(chosen.finetune * budget.act)
     learner = learn_physics(
         problem, workspace, "imitate", imitation, "imitate", budget.act - finetuning

@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 from array_api_compat import array_namespace
 
-from tsbench.errors import unknown
 from tsbench.mdp import Abstraction, Array, Readings, Rng, Start, State, Task, Tracker
 from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
 from tsbench.sim.model import load_spec
@@ -85,6 +84,7 @@ class Rocket(Task[RocketState]):
     observation_size: int = 10
     action_size: int = 2
     max_reward: float = GOAL_WEIGHT
+    imitation_forms: tuple[str, ...] = ("progress", "paper")
 
     @property
     def goal(self) -> np.ndarray:
@@ -345,9 +345,7 @@ class Rocket(Task[RocketState]):
         the path's length L lies before xbar. The printed form is itself sparse when the goal is
         far (docs/calibration.md) (D).
         """
-        form = form or "progress"
-        if form not in ("progress", "paper"):
-            raise unknown(f"imitation reward of {self.name}", form, ("progress", "paper"))
+        form = self.imitation_form(form)
         remaining = np.linalg.norm(reference.qpos[:, :2] - self.goal, axis=-1)
         arrival = int(np.argmax(remaining < remaining.min() + 0.05))  # the rest is hovering
         path = Path.through(reference.qpos[: max(arrival, 1) + 1, :2])

@@ -1,0 +1,203 @@
+"""The methods, end to end with tiny budgets: what they leave can be read back and scored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tsbench import TsbenchError, methods, tasks
+from tsbench.evaluation.evaluate import check_fit, evaluate
+from tsbench.methods import twostage
+from tsbench.motion import Plan, ReferenceMotion
+from tsbench.policy import Policy, PolicyInfo
+from tsbench.problem import Budget, Problem
+from tsbench.sim.kinematic import Planning
+from tsbench.sim.tracking import Imitation
+
+ENVIRONMENTS, ROLLOUT = 8, 8
+TRAINING = {
+    kind: {"rollout": ROLLOUT, "epochs": 1, "minibatches": 2, "hidden": [16]}
+    for kind in ("plan", "imitate", "task")
+}
+
+
+@dataclass
+class Desk:
+    """A workspace that remembers what it is told."""
+
+    directory: Path
+    stages: list[tuple[str, int]] = field(default_factory=list)
+    reports: dict[str, list[int]] = field(default_factory=dict)
+    substeps: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str, steps: int) -> Iterator[Any]:
+        self.stages.append((name, steps))
+        monitor = Scribe(self.reports.setdefault(name, []))
+        yield monitor
+        self.substeps[name] = monitor.physics_substeps
+
+    def note(self, line: str) -> None:
+        self.notes.append(line)
+
+
+@dataclass
+class Scribe:
+    steps: list[int]
+    physics_substeps: int = 0
+
+    def update(self, steps: int, metrics: Mapping[str, float]) -> None:
+        assert all(np.isfinite(value) for value in metrics.values())
+        self.steps.append(steps)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def problem(task_name: str, seed: int = 0, constants: Any = None, **options: Any) -> Problem:
+    task = tasks.make(task_name, **(constants or {}))
+    return Problem(task, Budget(192, 128, ENVIRONMENTS), TRAINING, options, seed, threads=1)
+
+
+def bits(policy: Policy) -> bytes:
+    arrays = (policy.mean, policy.scale, *policy.weights, *policy.biases)
+    return b"".join(array.tobytes() for array in arrays)
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_twostage(name: str, tmp_path: Path) -> None:
+    desk, given = Desk(tmp_path), problem(name, name="twostage")
+    policy = methods.find("twostage").train(given, desk)
+    task = given.task
+    assert desk.stages == [("plan", 192), ("imitate", 128)]
+    assert desk.reports == {"plan": [64, 128, 192], "imitate": [64, 128]}
+    assert desk.substeps == {"plan": 0, "imitate": 128 * task.substeps}
+
+    plan = Plan.load(tmp_path / "plan.npz")
+    abstraction = task.abstraction()
+    assert (plan.task, plan.task_version) == (name, task.version)
+    assert plan.timestep == abstraction.timestep
+    assert plan.states.shape[1] == len(abstraction.coordinates)
+    np.testing.assert_array_equal(plan.states[0], abstraction.flatten(abstraction.start(1))[0])
+    reference = ReferenceMotion.load(tmp_path / "reference.npz")
+    assert reference.duration <= plan.times[-1] + 1e-9
+    assert Imitation(task, reference).horizon >= 1
+    # The audit is told, item by item, in plain words.
+    audit = task.audit(plan, reference)
+    if audit.passed:
+        assert desk.notes == ["plan audit: passed"]
+    else:
+        assert desk.notes == [f"plan audit: {item}" for item in audit.failures]
+
+    check_fit(policy, task)
+    assert policy.info.method == "twostage"
+    policy.save(tmp_path)
+    again = Policy.load(tmp_path)
+    assert bits(again) == bits(policy)
+    assert evaluate(again, task, episodes=2, threads=1) == evaluate(
+        policy, task, episodes=2, threads=1
+    )
+    files = ["plan.npz", "policy.json", "policy.safetensors", "reference.npz"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == files
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_monolithic(name: str, tmp_path: Path) -> None:
+    """It has the budget of all stages together and leaves nothing but a policy."""
+    desk, given = Desk(tmp_path), problem(name)
+    policy = methods.find("monolithic").train(given, desk)
+    assert desk.stages == [("train", 320)]
+    assert desk.reports == {"train": [64, 128, 192, 256, 320]}
+    assert desk.substeps == {"train": 320 * given.task.substeps}
+    check_fit(policy, given.task)
+    assert policy.info.method == "monolithic"
+    assert not list(tmp_path.iterdir())
+    policy.save(tmp_path)
+    assert bits(Policy.load(tmp_path)) == bits(policy)
+
+
+@pytest.mark.parametrize("method", methods.names())
+def test_the_same_bits_under_a_seed(method: str, tmp_path: Path) -> None:
+    results = []
+    for seed in (1, 1, 2):
+        given = problem("rocket_obstacles", seed, constants={"distance": 5.0})
+        results.append(bits(methods.find(method).train(given, Desk(tmp_path))))
+    assert results[0] == results[1] != results[2]
+
+
+def test_finetuning(tmp_path: Path) -> None:
+    """A last stage on the task's own reward, paid from the physics budget."""
+    desk = Desk(tmp_path)
+    twostage.train(problem("laikago_walk", finetune=0.5), desk)
+    assert desk.stages == [("plan", 192), ("imitate", 64), ("finetune", 64)]
+    assert desk.substeps["finetune"] == 64 * 20
+
+
+def test_the_papers_imitation_reward(tmp_path: Path) -> None:
+    """Another form of the reward trains another policy from the same plan."""
+    forms: list[Any] = [None, "progress", "paper"]
+    results = []
+    for form in forms:
+        given = problem("rocket_navigation", constants={"distance": 5.0}, imitation=form)
+        results.append(bits(twostage.train(given, Desk(tmp_path))))
+    assert results[0] == results[1] != results[2]
+
+
+def test_the_plan_is_one_deterministic_episode() -> None:
+    """Of a policy that always flies up and to the left, out of the world."""
+    task = tasks.make("rocket_navigation")
+    planning = Planning(task)
+
+    class Always(Policy):
+        def __call__(self, observation: np.ndarray) -> np.ndarray:
+            return np.tile([-1.0, 0.4, 0.0], (len(observation), 1))
+
+    info = PolicyInfo(task.name, task.version, "", "", "elu", (7, 3))
+    plan = twostage.extract(planning, Always(info, np.zeros(7), np.ones(7), (), ()))
+    # Left at 0.25 m per step: -10 m after 40 steps, and out of the world with the 41st.
+    assert plan.states.shape == (42, 3)
+    assert plan.rewards.shape == (41,)
+    np.testing.assert_allclose(plan.states[:, 0], -0.25 * np.arange(42))
+    np.testing.assert_allclose(plan.states[:, 1], 0.1 * np.arange(42))
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("twostage", {"finetun": 0.1}, r"unknown key in method 'finetun'.*did you mean 'finetune'"),
+        ("twostage", {"finetune": 1.0}, r"method.finetune must lie in \[0, 1\)"),
+        ("twostage", {"finetune": "half"}, r"method.finetune must be a number"),
+        ("twostage", {"explore": -0.1}, r"method.explore must lie in \[0, 1\]"),
+        ("twostage", {"imitation": "papr"}, r"'papr'.*allowed: paper, progress"),
+        ("monolithic", {"finetune": 0.1}, r"unknown key in method 'finetune'"),
+    ],
+)
+def test_options_that_make_no_sense(
+    method: str, options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TsbenchError, match=message):
+        methods.find(method).train(problem("rocket_navigation", **options), Desk(tmp_path))
+
+
+def test_no_such_method() -> None:
+    with pytest.raises(TsbenchError, match=r"unknown method 'twostag'.*did you mean 'twostage'\?"):
+        methods.find("twostag")
+
+
+@pytest.mark.parametrize("name", methods.names())
+def test_every_method_says_what_it_is(name: str) -> None:
+    module = methods.find(name)
+    assert module.Options() == module.Options()
+    summary = methods.summary(name)
+    assert 20 < len(summary) < 100
+    assert "\n" not in summary

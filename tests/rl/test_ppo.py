@@ -1,0 +1,252 @@
+"""The learner: the same bits under a seed, steps counted, and something learned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tsbench import TsbenchError, tasks
+from tsbench.motion import ReferenceMotion
+from tsbench.policy import Policy
+from tsbench.problem import Budget, Problem
+from tsbench.rl.ppo import Learner, PPOSettings
+from tsbench.rl.stages import settings
+from tsbench.rl.vec_env import TorchEnvironment
+from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.episodes import play
+from tsbench.sim.kinematic import Planning
+from tsbench.sim.tracking import Imitation
+
+TINY = PPOSettings(environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,))
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def planning(distance: float = 3.0) -> Planning[Any]:
+    return Planning(tasks.make("rocket_navigation", distance=distance))
+
+
+def learner(
+    chosen: PPOSettings = TINY, seed: int = 0, subject: Any = None, **options: Any
+) -> Learner:
+    subject = subject or planning()
+    dynamics = subject
+    if not isinstance(subject, Planning):
+        dynamics = Physics(subject, chosen.environments, threads=1)
+    environment = BatchedEnvironment(subject, dynamics, chosen.environments, seed)
+    return Learner(environment, chosen, seed, **options)
+
+
+def bits(policy: Policy) -> bytes:
+    arrays = (policy.mean, policy.scale, *policy.weights, *policy.biases)
+    return b"".join(array.tobytes() for array in arrays)
+
+
+def trained(steps: int, seed: int = 0, subject: Any = None) -> Policy:
+    subject = subject or planning()
+    taught = learner(seed=seed, subject=subject)
+    taught.learn(steps)
+    return taught.policy(getattr(subject, "task", subject), "test")
+
+
+@pytest.mark.parametrize("kind", ["planning", "task", "imitation"])
+def test_the_same_bits_under_a_seed(
+    kind: str, naive_reference: Callable[[str], ReferenceMotion]
+) -> None:
+    name = "laikago_trot"
+    task = tasks.make(name)
+    subjects = {
+        "planning": planning(),
+        "task": task,
+        "imitation": Imitation(task, naive_reference(name)),
+    }
+    first, second, other = (trained(256, seed, subjects[kind]) for seed in (3, 3, 4))
+    assert bits(first) == bits(second)
+    assert bits(first) != bits(other)
+    assert bits(first) != bits(trained(0, 3, subjects[kind]))
+
+
+def test_steps_are_counted() -> None:
+    """In whole iterations of 8 environments x 16 steps."""
+    taught = learner()
+    reports: list[tuple[int, Mapping[str, float]]] = []
+    taught.learn(129, lambda steps, metrics: reports.append((steps, dict(metrics))))
+    assert [steps for steps, _ in reports] == [128, 256]
+    assert taught.steps == 256
+    taught.learn(0)
+    assert taught.steps == 256
+    taught.learn(1, lambda steps, metrics: reports.append((steps, dict(metrics))))
+    assert reports[-1][0] == taught.steps == 384
+    for _, metrics in reports:
+        assert all(math.isfinite(value) for value in metrics.values())
+        assert metrics["std"] > 0.0
+        assert metrics["learning_rate"] > 0.0
+        # 3 m: 0.52 s to fly and half as long again, 0.78 s, are 15 planning steps.
+        assert metrics["episode_length"] == 15.0
+        assert 0.0 < metrics["episode_return"] < 15 * 0.9
+
+
+def test_physics_steps_are_counted() -> None:
+    task = tasks.make("laikago_walk")
+    physics = Physics(task, 8, threads=1)
+    Learner(BatchedEnvironment(task, physics, 8, 0), TINY, 0).learn(128)
+    assert physics.substeps == 128 * 20
+
+
+def mean_return(subject: Planning[Any], policy: Policy) -> float:
+    return float(play(subject, subject, policy, 1, seed=0).returns[0])
+
+
+def test_it_learns_to_fly_to_a_goal() -> None:
+    """3 m away: nearly as good as straight there, from nearly as bad as standing still."""
+    subject = planning()
+    chosen = PPOSettings(
+        environments=64, rollout=15, hidden=(32,), discount=0.95, learning_rate=3e-3,
+        desired_kl=0.05,
+    )  # fmt: skip
+    taught = learner(chosen, subject=subject)
+    before = mean_return(subject, taught.policy(subject.task, "test"))
+    taught.learn(30_000)
+    after = mean_return(subject, taught.policy(subject.task, "test"))
+    still = 15 * 0.9 * math.exp(-0.75)  # 3 m away
+    # 0.25 m per step and axis: 11 steps along, 6 up.
+    best = sum(
+        0.9 * math.exp(-0.25 * math.hypot(max(2.598 - 0.25 * k, 0), max(1.5 - 0.25 * k, 0)))
+        for k in range(1, 16)
+    )
+    assert before < still + 1.0
+    assert after > still + 0.9 * (best - still)
+    assert after <= best + 1e-3
+
+
+def test_the_first_actions_are_the_nominal_pose() -> None:
+    subject = tasks.make("laikago_walk")
+    policy = trained(0, subject=subject)
+    observation = np.random.default_rng(0).normal(size=(50, 43))
+    assert np.abs(policy(observation)).max() < 0.05
+
+
+def test_going_on_with_another_reward() -> None:
+    """The actor and both normalisers are taken over; the critic and the noise start anew."""
+    first = learner(subject=tasks.make("rocket_navigation", distance=3.0))
+    first.learn(512)
+    second = learner(
+        PPOSettings(environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,),
+                    initial_std=0.25),
+        seed=9, subject=tasks.make("rocket_navigation", distance=3.0), actor_from=first,
+    )  # fmt: skip
+    task = tasks.make("rocket_navigation", distance=3.0)
+    assert bits(second.policy(task, "test")) == bits(first.policy(task, "test"))
+    reports: list[float] = []
+    second.learn(128, lambda _, metrics: reports.append(metrics["std"]))
+    assert reports[0] == pytest.approx(0.25, abs=0.05)
+    assert second.steps == 128
+    assert bits(second.policy(task, "test")) != bits(first.policy(task, "test"))
+
+
+def test_the_artefact_is_the_actor() -> None:
+    taught = learner()
+    taught.learn(256)
+    policy = taught.policy(tasks.make("rocket_navigation", distance=3.0), "test")
+    assert policy.info.layers == (7, 16, 3)
+    assert (policy.info.task, policy.info.method) == ("rocket_navigation", "test")
+    environment = TorchEnvironment(taught.environment)
+    actor = taught._ppo.actor
+    actor.eval()
+    with torch.inference_mode():
+        expected = actor(environment.get_observations()).clamp(-1.0, 1.0).numpy()
+    observation = taught.environment.mdp.observation(taught.environment.state)
+    np.testing.assert_allclose(policy(observation), expected, atol=1e-6)
+
+
+def test_what_rsl_rl_sees() -> None:
+    """Float32 tensors, time-outs told from endings, nothing shared between steps."""
+    subject = planning()
+    environment = TorchEnvironment(BatchedEnvironment(subject, subject, 2, 0))
+    first = environment.get_observations()
+    assert (environment.num_envs, environment.num_actions) == (2, 3)
+    assert environment.max_episode_length == subject.horizon == 15
+    assert first["policy"].shape == (2, 7)
+    assert first["policy"].dtype == torch.float32
+    kept = first["policy"].clone()
+    # One stands, one leaves the world: it is at -10 m after 40 steps, so move the border there.
+    actions = torch.tensor([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    environment.environment.state = environment.environment.state.replace(
+        position=np.array([[0.0, 0.0], [-8.6, 0.0]])
+    )
+    for step in range(1, 16):
+        observation, reward, done, extras = environment.step(actions)
+        assert reward.dtype == torch.float32
+        assert observation["value"].shape[0] == 2
+        assert done.tolist() == [int(step == 15), int(step == 6)]
+        assert extras["time_outs"].tolist() == [float(step == 15), 0.0]
+        # From there the second one has nine steps of its own, at 0.25 m each.
+    assert torch.equal(first["policy"], kept)
+    assert environment.episode_length_buf.tolist() == [0, 9]
+
+
+# Settings
+
+
+def problem(environments: int | None = None, **training: Any) -> Problem:
+    task = tasks.make("rocket_navigation")
+    return Problem(task, Budget(1, 1, environments), training, {}, seed=0, threads=1)
+
+
+def test_settings() -> None:
+    assert settings(problem(), "plan") == PPOSettings()
+    chosen = settings(problem(plan={"hidden": [32, 16], "discount": 1, "desired_kl": None}), "plan")
+    assert chosen.hidden == (32, 16)
+    assert (chosen.discount, chosen.desired_kl) == (1.0, None)
+    assert settings(problem(plan={"entropy": 0.5}), "task") == PPOSettings()
+    assert settings(problem(16, plan={"environments": 999}), "plan").environments == 16
+    # The last stage goes on with the imitation's network.
+    both = problem(imitate={"hidden": [8], "entropy": 0.1}, finetune={"entropy": 0.2})
+    assert settings(both, "finetune") == PPOSettings(hidden=(8,), entropy=0.2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"entropi": 0.1}, r"task.training.plan.*'entropi'.*did you mean 'entropy'"),
+        ({"entropy": "much"}, r"task.training.plan.entropy must be a number, not 'much'"),
+        ({"rollout": 1.5}, r"task.training.plan.rollout must be a whole number, not 1.5"),
+        ({"hidden": 64}, r"task.training.plan.hidden must be a list"),
+        ({"hidden": [64, "a"]}, r"task.training.plan.hidden\[1\] must be a whole number"),
+        ({"hidden": []}, "hidden"),
+        ({"hidden": [0]}, "hidden"),
+        ({"bootstrap": 1}, r"task.training.plan.bootstrap must be true or false"),
+        ({"environments": 0}, r"environments must be at least 1, not 0"),
+        ({"rollout": 0}, r"rollout must be at least 1"),
+        ({"epochs": -1}, r"epochs must be at least 1"),
+        ({"minibatches": 0}, r"minibatches must be at least 1"),
+        ({"environments": 2, "rollout": 2, "minibatches": 5}, "minibatches"),
+        ({"learning_rate": 0.0}, r"learning_rate must be positive"),
+        ({"learning_rate": float("nan")}, r"learning_rate must be positive"),
+        ({"initial_std": -1.0}, r"initial_std must be positive"),
+        ({"discount": 1.01}, r"discount must lie in \[0, 1\]"),
+        ({"gae_lambda": -0.1}, r"gae_lambda must lie in \[0, 1\]"),
+        ({"activation": "selu"}, r"activation must be one of elu, relu, tanh"),
+        ({"clip": -0.2}, r"clip"),
+        ({"desired_kl": 0.0}, r"desired_kl"),
+        ({"entropy": float("inf")}, r"entropy"),
+        ({"value_weight": -1.0}, r"value_weight"),
+    ],
+)
+def test_settings_that_make_no_sense(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(TsbenchError, match=message) as caught:
+        settings(problem(plan=changes), "plan")
+    assert "\n" not in str(caught.value)
+
+
+def test_no_such_stage() -> None:
+    with pytest.raises(TsbenchError, match=r"'task.training.imitat'.*allowed"):
+        settings(problem(), "imitat")

@@ -1,0 +1,306 @@
+"""The batched simulation against the dm_control environment: equal floats over whole episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import tsbench
+from tsbench import tasks
+from tsbench.mdp import Start, State, Task
+from tsbench.motion import ReferenceMotion
+from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.kinematic import Planning
+from tsbench.sim.single import environment
+from tsbench.sim.tracking import Imitation
+
+ROWS = 3
+Actions = Callable[[np.random.Generator, int, int], np.ndarray]
+
+
+@dataclass
+class Placed:
+    """A task whose episodes begin where the test says."""
+
+    task: Task[Any]
+    starts: Start
+
+    def start(self, rng: np.random.Generator, count: int, *, perturbed: bool = False) -> Start:
+        assert count == len(self.starts.time)
+        return self.starts
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.task, name)
+
+
+def row(start: Start, index: int) -> Start:
+    return Start(*(getattr(start, field.name)[index : index + 1] for field in fields(Start)))
+
+
+def same(first: State, second: State) -> bool:
+    """Whether two states are equal to the last bit."""
+    pairs = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(first)]
+    return all(a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
+
+
+def play_batched(
+    task: Task[Any], starts: Start, actions: np.ndarray, threads: int = 1
+) -> tuple[list[Any], np.ndarray]:
+    """The states (T + 1) and rewards (T, rows) that `actions` (T, rows, a) lead to."""
+    physics = Physics(task, len(starts.time), threads=threads)
+    states = [physics.place(np.arange(len(starts.time)), starts)]
+    rewards = []
+    for action in actions:
+        states.append(physics.advance(states[-1], action))
+        rewards.append(task.reward(states[-2], action, states[-1]))
+    return states, np.array(rewards)
+
+
+def compare(task: Task[Any], starts: Start, actions: np.ndarray) -> list[int]:
+    """Plays `actions` (T, rows, a) both ways from `starts`; the steps at which episodes end."""
+    states, rewards = play_batched(task, starts, actions, threads=2)
+    observations = [task.observation(state) for state in states]
+    ends = []
+    for index in range(len(starts.time)):
+        single = environment(cast(Any, Placed(task, row(starts, index))), seed=0)
+        time_step = single.reset()
+        first = round(float(starts.time[index]) / task.timestep)
+        step = 0
+        while True:
+            (observed,) = time_step.observation.values()
+            assert observed.tobytes() == observations[step][index].tobytes(), (index, step)
+            at = states[step].rows(slice(index, index + 1))
+            assert same(cast(Any, single.task).state, at), (index, step)
+            if time_step.last():
+                break
+            time_step = single.step(actions[step, index])
+            assert time_step.reward == rewards[step, index], (index, step)
+            step += 1
+            terminal = bool(task.terminal(states[step])[index])
+            assert time_step.last() == (terminal or first + step >= task.horizon)
+            assert time_step.discount == (0.0 if terminal else 1.0)
+        ends.append(first + step)
+    return ends
+
+
+def uniform(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    return rng.uniform(-1.0, 1.0, (steps, ROWS, size))
+
+
+def small(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    return 0.1 * rng.normal(size=(steps, ROWS, size))
+
+
+def wandering(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    """Smooth, and now and then outside the box."""
+    return np.cumsum(0.3 * rng.normal(size=(steps, ROWS, size)), axis=0)
+
+
+def zero(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    return np.zeros((steps, ROWS, size))
+
+
+def hover(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    """The rocket's least thrust at every other step is its weight, 12.5 N."""
+    actions = np.zeros((steps, ROWS, size))
+    actions[::2, :, 0] = 0.5
+    return actions
+
+
+LAIKAGO: list[tuple[Actions, bool, bool]] = [  # actions, perturbed start, lasts to the horizon
+    (uniform, True, False),
+    (wandering, True, False),
+    (small, True, False),  # creeps backward
+    (zero, True, True),
+]
+ROCKET: list[tuple[Actions, bool, bool]] = [
+    (uniform, True, False),
+    (wandering, True, False),
+    (zero, True, False),
+    (hover, False, True),
+]
+
+
+@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("regime", range(4))
+def test_equal_over_whole_episodes(name: str, regime: int) -> None:
+    actions, perturbed, to_the_end = (LAIKAGO if name.startswith("laikago") else ROCKET)[regime]
+    task = tasks.make(name)
+    rng = np.random.default_rng(11)
+    starts = task.start(rng, ROWS, perturbed=perturbed)
+    ends = compare(task, starts, actions(rng, task.horizon, task.action_size))
+    assert [end == task.horizon for end in ends] == [to_the_end] * ROWS
+
+
+@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("actions", [uniform, small])
+def test_imitation_is_equal_over_whole_episodes(
+    name: str, actions: Actions, naive_reference: Callable[[str], ReferenceMotion]
+) -> None:
+    task = Imitation(tasks.make(name), naive_reference(name))
+    rng = np.random.default_rng(5)
+    starts = task.start(rng, ROWS)
+    assert np.any(starts.time > 0.0)
+    compare(task, starts, actions(rng, task.horizon, task.action_size))
+
+
+def test_equal_through_a_collision() -> None:
+    """Rockets that fall onto an obstacle and roll off it."""
+    task = tasks.make("rocket_obstacles")
+    above = np.add(task.constants()["obstacles"][0], [0.0, 1.5])
+    qpos = np.array([[*above, 0.0], [*above, 0.4], [above[0] + 0.7, above[1], 2.0]])
+    starts = Start(np.zeros(ROWS), qpos, np.zeros((ROWS, 3)), np.zeros((ROWS, 0)))
+    actions = np.zeros((task.horizon, ROWS, 2))
+    states, _ = play_batched(task, starts, actions[:100])
+    assert np.all(np.any([task.violated(state) for state in states], axis=0))
+    compare(task, starts, actions)
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_rows_do_not_know_each_other(name: str) -> None:
+    """The same for any number of threads, any batch around a row, and any order of rows."""
+    task = tasks.make(name)
+    rng = np.random.default_rng(0)
+    starts = task.start(rng, 7, perturbed=True)
+    actions = rng.uniform(-1.0, 1.0, (40, 7, task.action_size))
+    states, rewards = play_batched(task, starts, actions, threads=1)
+    threaded, _ = play_batched(task, starts, actions, threads=2)
+    assert all(same(*pair) for pair in zip(states, threaded, strict=True))
+
+    alone, alone_rewards = play_batched(task, row(starts, 4), actions[:, 4:5])
+    assert all(same(a.rows(slice(4, 5)), b) for a, b in zip(states, alone, strict=True))
+    np.testing.assert_array_equal(rewards[:, 4:5], alone_rewards)
+
+    order = np.array([3, 6, 0, 5, 1, 4, 2])
+    shuffled = Start(*(getattr(starts, field.name)[order] for field in fields(Start)))
+    permuted, permuted_rewards = play_batched(task, shuffled, actions[:, order])
+    assert all(same(a.rows(order), b) for a, b in zip(states, permuted, strict=True))
+    np.testing.assert_array_equal(rewards[:, order], permuted_rewards)
+
+
+@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("variant", [None, "planning"])
+def test_episodes_begin_anew(name: str, variant: tsbench.Variant | None) -> None:
+    """Several episodes on end: each is what a fresh environment would give."""
+    steps = 200 if variant and name.startswith("laikago") else 500
+    batch = tsbench.load_batched(name, variant, count=2, threads=1)
+    rng = np.random.default_rng(1)
+    actions = rng.uniform(-1.0, 1.0, (steps, 2, batch.mdp.action_size))
+    if name.startswith("laikago") and variant is None:
+        actions[30:220, 0] = 0.0  # for one, a second episode that lasts to the horizon
+    observations, transitions = [batch.reset()], []
+    for action in actions:
+        transitions.append(batch.step(action))
+        observations.append(transitions[-1].observation)
+    episodes = 0
+    for index in range(2):
+        single = tsbench.load(name, variant)
+        time_step = single.reset()
+        for step in range(steps):
+            (observed,) = time_step.observation.values()
+            assert observed.tobytes() == observations[step][index].tobytes()
+            time_step = single.step(actions[step, index])
+            transition = transitions[step]
+            assert time_step.reward == transition.reward[index]
+            ended = transition.terminal[index] or transition.truncated[index]
+            assert time_step.last() == ended
+            if ended:
+                assert time_step.discount == (0.0 if transition.terminal[index] else 1.0)
+                time_step = single.reset()
+                episodes += 1
+    assert episodes >= 2
+
+
+def test_a_start_leaves_the_others_alone() -> None:
+    task = tasks.make("laikago_trot")
+    rng = np.random.default_rng(0)
+    starts = task.start(rng, 4, perturbed=True)
+    physics, undisturbed = Physics(task, 4, threads=1), Physics(task, 4, threads=1)
+    state, expected = (p.place(np.arange(4), starts) for p in (physics, undisturbed))
+    for step in range(12):
+        action = rng.uniform(-1.0, 1.0, (4, 12))
+        state, expected = physics.advance(state, action), undisturbed.advance(expected, action)
+        if step == 5:
+            fresh = physics.begin(rng, np.array([0, 2]))
+            state = state.updated(np.array([0, 2]), fresh)
+            assert np.all(state.time[[0, 2]] == 0.0)
+    others = np.array([1, 3])
+    assert same(state.rows(others), expected.rows(others))
+    assert not np.any(state.base_position[[0, 2]] == expected.base_position[[0, 2]])
+
+
+def test_states_are_not_overwritten() -> None:
+    task = tasks.make("rocket_obstacles")
+    physics = Physics(task, 2, threads=1)
+    state = physics.begin(np.random.default_rng(0), np.arange(2))
+    before = [getattr(state, f.name).copy() for f in fields(state)]
+    physics.advance(state, np.ones((2, 2)))
+    for field, value in zip(fields(state), before, strict=True):
+        np.testing.assert_array_equal(getattr(state, field.name), value)
+    assert physics.substeps == 2
+    laikago = Physics(tasks.make("laikago_walk"), 3, threads=1)
+    laikago.advance(laikago.begin(np.random.default_rng(0), np.arange(3)), np.zeros((3, 12)))
+    assert laikago.substeps == 60
+
+
+def test_a_push_moves_the_body_and_is_equal() -> None:
+    """100 N to the left on the trunk for three control steps."""
+    task = tasks.make("laikago_trot")
+    physics = Physics(task, 2, threads=1)
+    state = physics.begin(np.random.default_rng(0), np.arange(2))
+    single = tsbench.load("laikago_trot")
+    single.reset()
+    trunk = single.physics.model.name2id("trunk", "body")
+    pushes = physics.batch.bind("xfrc_applied")
+    for step in range(20):
+        force = 100.0 if 5 <= step < 8 else 0.0
+        pushes[0, trunk, 1] = force
+        single.physics.data.xfrc_applied[trunk, 1] = force
+        state = physics.advance(state, np.zeros((2, 12)))
+        single.step(np.zeros(12))
+        assert same(state.rows(slice(0, 1)), cast(Any, single.task).state)
+    assert state.base_position[0, 1] > state.base_position[1, 1] + 0.01
+
+
+def test_truncation_and_termination() -> None:
+    """An episode that ends in a terminal state at its last step is terminal."""
+    task = tasks.make("rocket_navigation")
+    planning = Planning(task)
+    batch = BatchedEnvironment(planning, planning, 2, 0)
+    batch.reset()
+    # Down at 5 m/s: 10 m take 40 steps, the 41st is out of bounds.
+    action = np.tile([[0.0, -1.0, 0.0], [0.0, 0.0, 0.0]], (1, 1))
+    for step in range(1, 42):
+        transition = batch.step(action)
+        assert transition.terminal.tolist() == [step == 41, False]
+        assert not transition.truncated.any()
+        assert batch.steps.tolist() == [step % 41, step]
+    batch.steps[:] = planning.horizon - 1  # as if all this had taken longer
+    batch.state = batch.state.replace(position=np.array([[0.0, -10.0], [0.0, 0.0]]))
+    transition = batch.step(action)
+    assert transition.terminal.tolist() == [True, False]
+    assert transition.truncated.tolist() == [False, True]
+    assert batch.steps.tolist() == [0, 0]
+    np.testing.assert_array_equal(batch.state.position, np.zeros((2, 2)))
+
+
+def test_steps_count_from_where_the_reference_is(
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    task = Imitation(tasks.make("laikago_walk"), naive_reference("laikago_walk"))
+    batch = BatchedEnvironment(task, Physics(task, 200, threads=1), 200, 0)
+    batch.reset()
+    np.testing.assert_allclose(batch.state.time, batch.steps / 30)
+    assert batch.steps.max() > 100
+    last = batch.steps == task.horizon - 1
+    assert last.any()
+    transition = batch.step(np.zeros((200, 12)))
+    np.testing.assert_array_equal(transition.truncated, last & ~transition.terminal)
+    for _ in range(5):  # and again where a new episode has begun
+        batch.step(np.zeros((200, 12)))
+        np.testing.assert_allclose(batch.state.time, batch.steps / 30)
+    assert np.any(batch.steps[last] > 6)

@@ -1,0 +1,152 @@
+"""Returns of whole episodes, on a task whose every reward is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tsbench.mdp import MDP, Array, State
+from tsbench.sim.episodes import Episodes, play
+
+HORIZON = 10
+
+
+@dataclass(frozen=True)
+class Line(State):
+    """Walkers on a line.
+
+    Attributes:
+        x: metres, shape (...,).
+        hurt: whether it happened on this step, shape (...,).
+    """
+
+    x: Array
+    hurt: Array
+
+
+class Walk(MDP[Line]):
+    """Reward: the distance walked. The goal is x = 4, the cliff x = -3; 7 hurts; 5 is both."""
+
+    name, version, horizon, timestep = "walk", 1, HORIZON, 0.5
+    observation_size, action_size, max_reward = 2, 1, 2.0
+
+    def __init__(self, starts: list[float]) -> None:
+        self.starts = starts
+        self.advanced = 0
+
+    def observation(self, state: Line) -> Array:
+        return np.stack([state.time, state.x], axis=-1)
+
+    def reward(self, previous: Line, action: Array, state: Line) -> Array:
+        return state.x - previous.x
+
+    def terminal(self, state: Line) -> Array:
+        return np.isin(state.x, [4.0, 5.0, -3.0])
+
+    def reached(self, state: Line) -> Array:
+        return np.isin(state.x, [4.0, 5.0])
+
+    def violated(self, state: Line) -> Array:
+        return state.hurt
+
+    def begin(self, rng: np.random.Generator, rows: np.ndarray) -> Line:
+        self.drawn = float(rng.uniform())
+        x = np.array(self.starts)[rows]
+        return Line(np.zeros(len(rows)), x, np.zeros(len(rows), bool))
+
+    def advance(self, state: Line, action: Array) -> Line:
+        self.advanced += 1
+        x = state.x + action[..., 0]
+        return Line(state.time + self.timestep, x, np.isin(x, [5.0, 7.0]))
+
+
+def walk(starts: list[float], speeds: list[float], **options: Any) -> Episodes[Line]:
+    mdp = Walk(starts)
+    return play(mdp, mdp, lambda _: np.array(speeds)[:, None], len(starts), seed=0, **options)
+
+
+@pytest.mark.parametrize(
+    ("start", "speed", "length", "reached", "violated", "total"),
+    [
+        (0.0, 1.0, 4, True, False, 4 * 1.0 + 6 * 2.0),  # six missing steps count as perfect
+        (0.0, 2.0, 2, True, False, 2 * 2.0 + 8 * 2.0),
+        (0.0, -1.0, 3, False, False, -3.0),  # seven missing steps count as nothing
+        (0.0, 0.0, 10, False, False, 0.0),
+        (0.0, 0.25, 10, False, False, 2.5),
+        (1.5, 0.25, 10, True, False, 2.5),  # at the goal with the last step: nothing is missing
+        (6.0, 1.0, 10, False, True, 10.0),  # hurt once on the way: spoiled for good
+        (6.0, -1.0, 1, False, True, -1.0),  # at a goal, but hurt: no credit
+        (7.0, -1.0, 2, False, True, -2.0),
+    ],
+)
+def test_one_episode(
+    start: float, speed: float, length: int, reached: bool, violated: bool, total: float
+) -> None:
+    episodes = walk([start], [speed])
+    assert episodes.lengths.tolist() == [length]
+    assert episodes.reached.tolist() == [reached]
+    assert episodes.violated.tolist() == [violated]
+    assert episodes.returns.tolist() == pytest.approx([total])
+    assert episodes.normalized.tolist() == pytest.approx([total / 20.0])  # 2 x 10 steps
+    assert episodes.final.x.tolist() == pytest.approx([start + length * speed])
+    assert episodes.final.time.tolist() == pytest.approx([0.5 * length])
+
+
+def test_many_side_by_side() -> None:
+    """What comes after an episode's end, and what the others do, changes nothing."""
+    starts, speeds = [0.0, 0.0, 6.0, 0.0], [1.0, -1.0, 1.0, 0.25]
+    together = walk(starts, speeds, record=lambda state: state.x)
+    for index, (start, speed) in enumerate(zip(starts, speeds, strict=True)):
+        alone = walk([start], [speed])
+        for name in ("returns", "lengths", "reached", "violated", "normalized"):
+            assert getattr(together, name)[index] == getattr(alone, name)[0]
+        np.testing.assert_array_equal(together.rewards[:, index], alone.rewards[:, 0])
+        np.testing.assert_array_equal(together.actions[:, index], alone.actions[:, 0])
+        assert together.final.x[index] == alone.final.x[0]
+    assert together.rewards.shape == (HORIZON, 4)
+    assert together.rewards[:, 0].tolist() == [1.0] * 4 + [0.0] * 6
+    assert together.actions[:, 1, 0].tolist() == [-1.0] * 3 + [0.0] * 7
+    assert together.states is not None
+    assert together.states[:, 0].tolist() == [0, 1, 2, 3, 4, 4, 4, 4, 4, 4, 4]
+    assert together.states[:, 1].tolist() == [0, -1, -2] + [-3] * 8
+
+
+def test_record_after_the_last_end() -> None:
+    """Play stops when nobody is left; the record is as long as ever."""
+    mdp = Walk([0.0, 0.0])
+    steps: list[int] = []
+    episodes = play(
+        mdp, mdp, lambda _: np.array([[2.0], [-1.0]]), 2, seed=0,
+        record=lambda state: np.stack([state.x, state.time], axis=-1), disturb=steps.append,
+    )  # fmt: skip
+    assert mdp.advanced == 3
+    assert steps == [0, 1, 2]
+    assert episodes.states is not None
+    assert episodes.states.shape == (HORIZON + 1, 2, 2)
+    assert episodes.states[-1].tolist() == [[4.0, 1.0], [-3.0, 1.5]]
+    assert walk([0.0], [1.0]).states is None
+
+
+def test_the_seed_is_the_starts() -> None:
+    drawn = []
+    for seed in (3, 3, 4):
+        mdp = Walk([0.0])
+        play(mdp, mdp, lambda _: np.zeros((1, 1)), 1, seed)
+        drawn.append(mdp.drawn)
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_the_policy_sees_the_present() -> None:
+    """Observation, action and reward of a step belong together."""
+    seen: list[Any] = []
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        seen.append(observation.tolist())
+        return np.array([[0.5]])
+
+    mdp = Walk([0.0])
+    play(mdp, mdp, policy, 1, seed=0)
+    assert seen == [[[0.5 * step, 0.5 * step]] for step in range(8)]

@@ -1,0 +1,659 @@
+"""Laikago's rewards, endings, gaits and filter against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import butter, freqz, lfilter
+from scipy.spatial.transform import Rotation
+
+from tsbench import TsbenchError, tasks
+from tsbench.mdp import Start
+from tsbench.motion import Plan, ReferenceMotion
+from tsbench.sim.batched import Physics
+from tsbench.sim.model import compiled
+from tsbench.tasks import laikago
+from tsbench.tasks.laikago import Laikago, LaikagoState, reference_times
+
+GAITS = ("laikago_walk", "laikago_trot")
+SOLE = 0.0265  # m, from a foot's centre down
+STANDING = np.array(  # foot centres under their hips, FR FL RR RL
+    [
+        [0.21935, -0.1245, SOLE],
+        [0.21935, 0.1245, SOLE],
+        [-0.21935, -0.1245, SOLE],
+        [-0.21935, 0.1245, SOLE],
+    ]
+)
+
+
+def make(name: str, **constants: Any) -> Laikago:
+    task = tasks.make(name, **constants)
+    assert isinstance(task, Laikago)
+    return task
+
+
+def state(
+    time: float = 0.0,
+    base: Any = (0.0, 0.0, 0.42),
+    feet: Any = STANDING,
+    com_height: float = 0.41,
+    orientation: Any = (1.0, 0.0, 0.0, 0.0),
+) -> LaikagoState:
+    base = np.array([base], float)
+    return LaikagoState(
+        time=np.array([time]),
+        joint_position=np.zeros((1, 12)),
+        joint_velocity=np.zeros((1, 12)),
+        base_position=base,
+        base_orientation=np.array([orientation], float),
+        base_velocity=np.zeros((1, 3)),
+        base_angular_velocity=np.zeros((1, 3)),
+        feet=np.array([feet], float),
+        com=np.array([[base[0, 0], base[0, 1], com_height]]),
+        filter=np.zeros((1, 48)),
+    )
+
+
+def moved(leg: int, **shift: float) -> np.ndarray:
+    """Standing feet, one of them shifted along x, y or z."""
+    feet = STANDING.copy()
+    for axis, metres in shift.items():
+        feet[leg, "xyz".index(axis)] += metres
+    return feet
+
+
+FR, FL, RR, RL = range(4)
+STEP = 1 / 30
+
+
+def terms(task: Laikago, previous: LaikagoState, after: LaikagoState) -> list[float]:
+    values = [float(term[0]) for term in task.reward_terms(previous, after)]
+    reward = task.reward(previous, np.zeros((1, 12)), after)[0]
+    assert reward == pytest.approx(values[0] * values[1] * values[2] * values[3])
+    return values
+
+
+# The task's constants
+
+
+@pytest.mark.parametrize(
+    ("name", "distance", "speed"), [("laikago_walk", 1.584, 0.264), ("laikago_trot", 3.78, 0.63)]
+)
+def test_constants(name: str, distance: float, speed: float) -> None:
+    task = make(name)
+    assert (task.version, task.substeps, task.max_reward) == (1, 20, 1.0)
+    assert (task.observation_size, task.action_size) == (43, 12)
+    assert task.timestep == pytest.approx(STEP)
+    assert task.distance == distance
+    assert task.horizon == 180  # six seconds: 60 planning steps
+    assert distance / speed == pytest.approx(6.0)
+    model = task.spec().compile()
+    assert model.opt.timestep * task.substeps == pytest.approx(task.timestep)
+    np.testing.assert_allclose(model.site("goal").pos[:2], [distance, 0.0])
+
+
+@pytest.mark.parametrize(("distance", "horizon"), [(1.26, 60), (2.52, 120), (6.3, 300)])
+def test_the_horizon_grows_with_the_distance(distance: float, horizon: int) -> None:
+    assert make("laikago_trot", distance=distance).horizon == horizon
+
+
+# Reward
+
+
+@pytest.mark.parametrize(
+    ("name", "base", "expected"),
+    [
+        ("laikago_walk", (0.0, 0.0, 0.42), 0.01906311),  # exp(-2.5 x 1.584) = exp(-3.96)
+        ("laikago_trot", (0.0, 0.0, 0.42), 7.868957e-05),  # exp(-9.45)
+        ("laikago_walk", (1.584, 0.0, 0.3), 1.0),  # on the ground plane: height is nothing
+        ("laikago_walk", (1.184, 0.3, 0.42), 0.2865048),  # 0.4 before, 0.3 beside: exp(-1.25)
+        ("laikago_walk", (1.984, -0.3, 0.42), 0.2865048),
+    ],
+)
+def test_r_dist(name: str, base: Any, expected: float) -> None:
+    at = state(base=base)
+    assert terms(make(name), at, at)[0] == pytest.approx(expected, rel=1e-3)
+
+
+# In the walk at 0.1 s only FL swings: phases .375, .875, .625, .125 with a duty of .75.
+@pytest.mark.parametrize(
+    ("time", "feet", "expected"),
+    [
+        (0.1, moved(FR, x=0.003, y=0.004), 0.9512294),  # exp(-10 x 0.005)
+        (0.1, moved(FR, x=-0.003, z=0.004), 0.9704455),  # only horizontally: exp(-0.03)
+        (0.1, moved(FL, x=0.05, y=0.05), 1.0),  # in swing
+        (
+            0.1,
+            STANDING + np.array([0.0088, 0.0, 0.0]),
+            0.7679733,
+        ),  # dragging all: exp(-10 x 3 x 0.0088)
+        (0.2, moved(FL, x=0.05), 1.0),  # FL touches down at 0.2 s: it was in the air before
+        (0.2 + STEP, moved(FL, x=0.05), 0.6065307),  # exp(-0.5)
+    ],
+)
+def test_r_ns(time: float, feet: np.ndarray, expected: float) -> None:
+    task = make("laikago_walk")
+    assert terms(task, state(time - STEP), state(time, feet=feet))[1] == pytest.approx(expected)
+
+
+def test_dragging_in_trot() -> None:
+    """Two feet are in stance: exp(-10 x 2 x 0.021)."""
+    before, after = state(0.1 - STEP), state(0.1, feet=STANDING + np.array([0.021, 0.0, 0.0]))
+    assert terms(make("laikago_trot"), before, after)[1] == pytest.approx(0.6570468)
+
+
+@pytest.mark.parametrize(
+    ("name", "time", "feet", "expected"),
+    [
+        ("laikago_walk", 0.1, STANDING, 0.1353353),  # FL should be 0.1 m up: exp(-20 x 0.1)
+        ("laikago_walk", 0.1, moved(FL, z=0.1), 1.0),
+        ("laikago_walk", 0.1, moved(FL, z=0.13), 0.5488116),  # exp(-20 x 0.03)
+        ("laikago_walk", 0.1, moved(FR, z=-0.02), 0.0907180),  # exp(-20 x (0.1 + 0.02))
+        ("laikago_walk", 0.0, STANDING, 1.0),  # all stand
+        ("laikago_trot", 0.1, STANDING, 0.01831564),  # two should be up: exp(-4)
+    ],
+)
+def test_r_ee_z(name: str, time: float, feet: np.ndarray, expected: float) -> None:
+    at = state(time, feet=feet)
+    assert terms(make(name), at, at)[2] == pytest.approx(expected, rel=1e-6)
+
+
+def test_r_ee_x() -> None:
+    feet = STANDING.copy()
+    feet[:, 0] += [0.01, -0.02, 0.0, 0.03]
+    feet[:, 1] += 0.3
+    values = terms(make("laikago_walk"), state(0.1 - STEP), state(0.1, feet=feet))
+    assert values[3] == pytest.approx(0.7866279)  # exp(-4 x 0.06)
+
+
+def test_reward_is_the_product() -> None:
+    """Walk, 0.1 s, 0.5 m from the goal; FR slips 1 cm forward, FL is 9 cm up."""
+    feet = moved(FL, z=0.09)
+    feet[FR, 0] += 0.01
+    before = state(0.1 - STEP, base=(1.084, 0.0, 0.42))
+    after = state(0.1, base=(1.084, 0.0, 0.42), feet=feet)
+    reward = make("laikago_walk").reward(before, np.zeros((1, 12)), after)[0]
+    # exp(-2.5 x 0.5 - 10 x 0.01 - 20 x 0.01 - 4 x 0.01) = exp(-1.59)
+    assert reward == pytest.approx(0.2039256, rel=1e-6)
+
+
+# Gaits
+
+
+def schedule(name: str, rate: float, cycles: int) -> list[str]:
+    """One string for each leg, # in stance, with a clock that runs as the simulation's does."""
+    task = make(name)
+    time, rows = np.zeros(1), []
+    for _ in range(round(cycles * task.gait.period * rate)):
+        rows.append(task.gait.contacts(time)[0])
+        time = time + 1 / rate
+    return ["".join("#" if stands else "." for stands in leg) for leg in np.array(rows).T]
+
+
+@pytest.mark.parametrize(
+    ("name", "rate", "expected"),
+    [
+        # A foot stands from touchdown to lift-off, both included.
+        (
+            "laikago_walk",
+            30,  # 24 frames; swings of 0.2 s, in the order FL, RR, FR, RL
+            [
+                "#############.....######",
+                "#.....##################",
+                "#######.....############",
+                "###################.....",
+            ],
+        ),
+        (
+            "laikago_trot",
+            30,  # 16 frames; swings of 0.267 s, FL with RR and FR with RL
+            [
+                "#########.......",
+                "#.......########",
+                "#.......########",
+                "#########.......",
+            ],
+        ),
+        ("laikago_walk", 10, ["#####.##", "#.######", "###.####", "#######."]),
+    ],
+)
+def test_contact_schedule(name: str, rate: float, expected: list[str]) -> None:
+    assert schedule(name, rate, 1) == expected
+    assert schedule(name, rate, 40) == [leg * 40 for leg in expected]
+
+
+@pytest.mark.parametrize(
+    ("name", "duty", "speed", "foot_speed", "radius"),
+    [("laikago_walk", 0.75, 0.264, 1.65, 0.48), ("laikago_trot", 0.5, 0.63, 1.26, 0.50)],
+)
+def test_both_speeds_are_reached_together(
+    name: str, duty: float, speed: float, foot_speed: float, radius: float
+) -> None:
+    gait = make(name).gait
+    assert (gait.duty, gait.base_speed) == (duty, speed)
+    assert (gait.foot_speed, gait.leg_length) == (foot_speed, radius)
+    # What a swing foot gains on the base, the base gains on a stance foot.
+    assert foot_speed * radius * (1 - duty) == pytest.approx(speed * duty)
+
+
+# Observation
+
+
+def test_observation() -> None:
+    rng = np.random.default_rng(0)
+    at = replace(
+        state(1.2, base=(0.4, -0.3, 0.41)),
+        joint_position=rng.normal(size=(1, 12)),
+        joint_velocity=rng.normal(size=(1, 12)),
+        base_orientation=np.array([[0.5, 0.5, -0.5, 0.5]]),
+        base_velocity=np.array([[1.0, 2.0, 3.0]]),
+        base_angular_velocity=np.array([[4.0, 5.0, 6.0]]),
+    )
+    expected = [
+        *at.joint_position[0],
+        *at.joint_velocity[0],
+        *(0.4, -0.3, 0.41),
+        *(0.5, 0.5, -0.5, 0.5),
+        *(1.0, 2.0, 3.0),
+        *(4.0, 5.0, 6.0),
+        0.2,  # of six seconds
+        *(0.0, -1.0),  # one and a half cycles of 0.8 s
+        *(1.184, 0.3),
+        1.221415,  # sqrt(1.401856 + 0.09)
+    ]
+    task = make("laikago_walk")
+    np.testing.assert_allclose(task.observation(at)[0], expected, atol=1e-6)
+    other_sign = replace(at, base_orientation=-at.base_orientation)
+    np.testing.assert_array_equal(task.observation(other_sign), task.observation(at))
+
+
+# Endings
+
+D = 1.584
+
+
+@pytest.mark.parametrize(
+    ("base", "com_height", "reached", "violated", "terminal"),
+    [
+        ((0.0, 0.0, 0.42), 0.41, False, False, False),
+        ((D - 0.0501, 0.0, 0.42), 0.41, False, False, False),
+        ((D - 0.0499, 0.0, 0.42), 0.41, True, False, True),
+        ((D, 0.0499, 0.42), 0.41, True, False, True),
+        ((-0.0499, 0.0, 0.42), 0.41, False, False, False),
+        ((-0.0501, 0.0, 0.42), 0.41, False, False, True),
+        ((D, D + 0.0499, 0.42), 0.41, False, False, False),
+        ((D, D + 0.0501, 0.42), 0.41, False, False, True),
+        ((0.0, 0.0, 0.42), 0.3201, False, False, False),
+        ((0.0, 0.0, 0.42), 0.3199, False, True, True),
+        ((0.0, 0.0, 0.30), 0.3201, False, False, False),  # it is the CoM that counts
+    ],
+)
+def test_endings(
+    base: Any, com_height: float, reached: bool, violated: bool, terminal: bool
+) -> None:
+    task = make("laikago_walk")
+    at = state(base=base, com_height=com_height)
+    assert task.reached(at).tolist() == [reached]
+    assert task.violated(at).tolist() == [violated]
+    assert task.terminal(at).tolist() == [terminal]
+
+
+@pytest.mark.parametrize(
+    ("base_x", "com_height", "solved"),
+    [
+        (D - 0.3167, 0.41, True),  # a fifth of the distance is 0.3168 m
+        (D - 0.3169, 0.41, False),
+        (D + 0.3167, 0.3201, True),
+        (D, 0.3199, False),
+    ],
+)
+def test_success(base_x: float, com_height: float, solved: bool) -> None:
+    at = state(base=(base_x, 0.0, 0.42), com_height=com_height)
+    assert make("laikago_walk").success(at).tolist() == [solved]
+
+
+# Action and filter
+
+
+def controls(actions: np.ndarray, start: LaikagoState | None = None) -> np.ndarray:
+    """Joint targets (T, 12) for a sequence of actions."""
+    task, at, targets = make("laikago_walk"), start or state(), []
+    for action in actions:
+        target, memory = task.control(at, action[None])
+        at = replace(at, filter=memory)
+        targets.append(target[0])
+    return np.array(targets)
+
+
+NOMINAL = np.array([0.0, 0.67, -1.33] * 4)
+
+
+def test_filter_is_a_butterworth_low_pass() -> None:
+    b, a = butter(2, 4.0, fs=30.0)
+    np.testing.assert_allclose(laikago.FILTER_B, b, rtol=1e-12)
+    np.testing.assert_allclose([1.0, *laikago.FILTER_A], a, rtol=1e-12)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 12))
+    expected = NOMINAL + lfilter(b, a, 0.75 * actions, axis=0)
+    np.testing.assert_allclose(controls(actions), expected, atol=1e-12)
+
+
+def test_filter_response() -> None:
+    """Gain 1 at rest and 1 / sqrt(2), which is -3 dB, at 4 Hz."""
+    _, response = freqz(laikago.FILTER_B, [1.0, *laikago.FILTER_A], worN=[0.0, 4.0], fs=30.0)
+    np.testing.assert_allclose(np.abs(response), [1.0, 0.7071068], rtol=1e-6)
+    time = np.arange(300) / 30
+    wave = np.tile(np.sin(2 * np.pi * 4.0 * time)[:, None], (1, 12))
+    settled = controls(wave)[-150:] - NOMINAL  # twenty whole waves
+    amplitude = np.sqrt(2.0 * np.mean(settled**2, axis=0))
+    np.testing.assert_allclose(amplitude, 0.75 * 0.7071068, rtol=1e-3)
+    # A held action is reached, the first step gives b0 of it, and no action exceeds the box.
+    held = controls(np.full((90, 12), 5.0))
+    np.testing.assert_allclose(held[0], NOMINAL + 0.108447 * 0.75, atol=1e-6)
+    np.testing.assert_allclose(held[-1], NOMINAL + 0.75, atol=1e-9)
+
+
+def test_filter_starts_settled() -> None:
+    """The action that holds a start's joints holds them from the first step on."""
+    task = make("laikago_trot")
+    start = task.start(np.random.default_rng(3), 1, perturbed=True)
+    joints = start.qpos[0, 7:]
+    assert np.abs(joints - NOMINAL).max() > 0.01
+    at = replace(state(), filter=start.memory)
+    hold = np.tile((joints - NOMINAL) / 0.75, (20, 1))
+    np.testing.assert_allclose(controls(hold, at), np.tile(joints, (20, 1)), atol=1e-12)
+
+
+# Starts
+
+
+def test_starts() -> None:
+    task = make("laikago_walk")
+    fixed = task.start(np.random.default_rng(0), 2)
+    np.testing.assert_allclose(fixed.qpos[:, 7:], [NOMINAL] * 2)
+    np.testing.assert_allclose(fixed.qpos[:, :7], [[0, 0, 0.42, 1, 0, 0, 0]] * 2, atol=2e-3)
+    assert not np.any(fixed.qvel)
+    assert not np.any(fixed.memory)
+
+    count = 2000
+    near = task.start(np.random.default_rng(0), count, perturbed=True)
+    np.testing.assert_allclose(np.linalg.norm(near.qpos[:, 3:7], axis=-1), 1.0)
+    turn = Rotation.from_quat(near.qpos[:, [4, 5, 6, 3]]).as_rotvec()
+    uniform = {
+        "joints": (near.qpos[:, 7:] - NOMINAL, 0.05),
+        "turn": (turn, 0.05),
+        "velocity": (near.qvel[:, :3], 0.1),
+        "angular velocity": (near.qvel[:, 3:6], 0.2),
+        "joint velocity": (near.qvel[:, 6:], 0.2),
+    }
+    for what, (values, bound) in uniform.items():
+        assert np.abs(values).max() <= bound * (1 + 1e-9), what
+        assert np.all(values.max(axis=0) > 0.97 * bound), what
+        assert np.all(values.min(axis=0) < -0.97 * bound), what
+        assert np.allclose(values.std(axis=0), bound / math.sqrt(3.0), rtol=0.06), what
+    assert not np.any(near.qpos[:, :2])
+    # It stands on the ground: no sole in it, nor the lowest one far above.
+    physics = Physics(task, count, threads=1)
+    lowest = physics.place(np.arange(count), near).feet[..., 2].min(axis=-1) - SOLE
+    assert lowest.min() > -1e-3
+    assert lowest.max() < 0.03
+
+
+# From plan to reference motion
+
+
+@pytest.mark.parametrize("name", GAITS)
+def test_reference_of_the_naive_plan(
+    name: str, naive_plan: Callable[[str], Plan], naive_reference: Callable[[str], ReferenceMotion]
+) -> None:
+    task, plan, reference = make(name), naive_plan(name), naive_reference(name)
+    times = np.arange(reference.steps + 1) * STEP
+    assert times[-1] == pytest.approx(plan.times[-1])
+    np.testing.assert_array_equal(reference.contacts, task.gait.contacts(times))
+    # The base goes straight ahead at top speed, once the feet have left their hips' sides.
+    speed = task.gait.base_speed
+    np.testing.assert_allclose(reference.qpos[:, 0], speed * times, atol=0.03)
+    np.testing.assert_allclose(reference.qpos[:, 1:3], [[0.0, 0.42]] * len(times), atol=1e-3)
+    np.testing.assert_allclose(reference.qvel[60:, 0], speed, atol=1e-9)
+    # Feet rest in stance, and in swing rise in a half sine of 10 cm and go forward.
+    soles = reference.feet[..., 2] - SOLE
+    assert np.abs(soles[reference.contacts]).max() < 2e-4
+    steps = np.diff(reference.feet[..., 0], axis=0)
+    stance = reference.contacts[1:] & reference.contacts[:-1]
+    assert np.abs(steps[stance]).max() < 3e-4
+    assert steps[~stance].min() > -3e-4
+    share = (task.gait.phase(times) - task.gait.duty) / (1.0 - task.gait.duty)
+    wanted = 0.1 * np.sin(np.pi * np.clip(share, 0.0, 1.0))
+    assert np.abs(soles - wanted)[~reference.contacts].max() < 2e-4
+    # The feet are those of the pose, and velocities are central differences.
+    joints = reference.qpos[:, 7:]
+    np.testing.assert_allclose(
+        reference.qvel[1:-1, 6:], (joints[2:] - joints[:-2]) / (2 * STEP), atol=1e-9
+    )
+    physics = Physics(task, len(times), threads=1)
+    memory = np.zeros((len(times), 48))
+    posed = physics.place(
+        np.arange(len(times)), Start(times, reference.qpos, reference.qvel, memory)
+    )
+    np.testing.assert_allclose(posed.feet, reference.feet, atol=1e-9)
+    np.testing.assert_allclose(posed.com, reference.com, atol=1e-9)
+    low, high = compiled("laikago").jnt_range[1:].T
+    assert np.all((joints > low) & (joints < high))
+
+
+def test_a_swing_by_hand(
+    naive_plan: Callable[[str], Plan], naive_reference: Callable[[str], ReferenceMotion]
+) -> None:
+    """Trot, FL lifts off at frame 0 and touches down at frame 8; frame 2 is a quarter of the way.
+
+    It starts under its hip. Then it stands until frame 16 where the plan lets it stand.
+    """
+    plan, reference = naive_plan("laikago_trot"), naive_reference("laikago_trot")
+    planned = np.interp(reference_times(reference), plan.times, plan.states[:, 3 + 3 * FL])
+    touchdown = planned[8]
+    assert touchdown > 0.35
+    np.testing.assert_allclose(planned[8:17], touchdown, atol=1e-9)
+    # Eased as s^2 (3 - 2 s) = 2.5 / 16, raised by 0.1 sin(45 degrees).
+    quarter = 0.21935 + 0.15625 * (touchdown - 0.21935)
+    expected = [quarter, 0.1245, SOLE + 0.0707107]
+    np.testing.assert_allclose(reference.feet[2, FL], expected, atol=2e-4)
+    np.testing.assert_allclose(reference.feet[8:17, FL, 0], touchdown, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", GAITS)
+def test_audit_passes_the_naive_plan(
+    name: str, naive_plan: Callable[[str], Plan], naive_reference: Callable[[str], ReferenceMotion]
+) -> None:
+    assert make(name).audit(naive_plan(name), naive_reference(name)).passed
+
+
+def _slipping(plan: Plan, reference: ReferenceMotion) -> tuple[Plan, ReferenceMotion]:
+    states = plan.states.copy()
+    states[:, 3] = states[:, 0] + STANDING[0, 0]  # FR is dragged along
+    changed = replace(plan, states=states)
+    return changed, make("laikago_trot").reference(changed)
+
+
+def _bent(plan: Plan, reference: ReferenceMotion) -> tuple[Plan, ReferenceMotion]:
+    qpos = reference.qpos.copy()
+    qpos[50, 9] = -0.61  # a calf that is stretched too far
+    return plan, replace(reference, qpos=qpos)
+
+
+def _flat(plan: Plan, reference: ReferenceMotion) -> tuple[Plan, ReferenceMotion]:
+    feet = reference.feet.copy()
+    feet[:, RR, 2] = SOLE
+    return plan, replace(reference, feet=feet)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "failure"),
+    [
+        (lambda p, r: (replace(p, states=p.states[:31], rewards=p.rewards[:30]), r),
+         "distance of the plan's end from the goal"),
+        (_slipping, "mean slip of a foot in stance"),
+        (_bent, "joint angle beyond its limit"),
+        (lambda p, r: (p, replace(r, qvel=3.0 * r.qvel)), "joint speed"),
+        (lambda p, r: (p, replace(r, feet=r.feet + 0.003)), "inverse kinematics error"),
+        (_flat, "missing swing clearance"),
+        (lambda p, r: (p, replace(r, com=r.com + 0.2)), "mean distance of CoM from support"),
+    ],
+)  # fmt: skip
+def test_audit_finds_what_is_wrong(
+    spoil: Callable[[Plan, ReferenceMotion], tuple[Plan, ReferenceMotion]],
+    failure: str,
+    naive_plan: Callable[[str], Plan],
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    name = "laikago_trot"
+    plan, reference = spoil(naive_plan(name), naive_reference(name))
+    failures = [item.what for item in make(name).audit(plan, reference).failures]
+    assert failure in failures
+    # A shorter plan also differs from its reference; a foot held down also misses its target.
+    assert len(failures) <= 2
+
+
+@pytest.mark.parametrize("name", GAITS)
+def test_audit_finds_dragged_feet(name: str, naive_plan: Callable[[str], Plan]) -> None:
+    """A plan whose feet stay under their hips, on the ground or not."""
+    task, plan = make(name), naive_plan(name)
+    states = plan.states.copy()
+    states[:, 3::3] = states[:, :1] + STANDING[:, 0]
+    dragging = replace(plan, states=states)
+    audit = task.audit(dragging, task.reference(dragging))
+    assert any("slip" in item.what for item in audit.failures)
+
+
+# Imitation
+
+
+def on_reference(
+    task: Laikago, reference: ReferenceMotion, frame: int, qpos: np.ndarray | None = None
+) -> LaikagoState:
+    """The state of a robot that is where the reference's frame is, or at `qpos` then."""
+    physics = Physics(task, 1, threads=1)
+    qpos = reference.qpos[frame] if qpos is None else qpos
+    time = np.array([frame * STEP])
+    memory = np.zeros((1, 48))
+    return physics.place(np.array([0]), Start(time, qpos[None], reference.qvel[[frame]], memory))
+
+
+def tracked(task: Laikago, reference: ReferenceMotion, at: LaikagoState) -> float:
+    return float(task.tracker(reference).reward(at, np.zeros((1, 12)), at)[0])
+
+
+@pytest.mark.parametrize("name", GAITS)
+@pytest.mark.parametrize("frame", [0, 1, 77, -1])
+def test_the_reference_itself_gets_everything(
+    name: str, frame: int, naive_reference: Callable[[str], ReferenceMotion]
+) -> None:
+    task, reference = make(name), naive_reference(name)
+    at = on_reference(task, reference, frame % (reference.steps + 1))
+    assert tracked(task, reference, at) == pytest.approx(1.0, abs=1e-9)
+    assert task.tracker(reference).max_reward == 1.0
+    assert task.tracker(reference).horizon == reference.steps
+
+
+def test_tracking_terms(naive_reference: Callable[[str], ReferenceMotion]) -> None:
+    task, reference = make("laikago_trot"), naive_reference("laikago_trot")
+    at = on_reference(task, reference, 40)
+    off = {
+        # 0.65 exp(-2 x 12 x 0.01) + 0.35
+        "joint_position": (at.joint_position + 0.1, 0.8613081),
+        # 0.65 + 0.1 exp(-0.1 x 12) + 0.25
+        "joint_velocity": (at.joint_velocity - 1.0, 0.9301194),
+        # 0.65 + 0.1 + 0.15 exp(-40 x 4 x 0.0004) + 0.1
+        "feet": (at.feet + np.array([0.0, 0.02, 0.0]), 0.9907007),
+        # 0.9 + 0.1 exp(-10 x 0.0025)
+        "com": (at.com + np.array([0.0, 0.0, 0.05]), 0.9975310),
+    }
+    for field, (value, expected) in off.items():
+        assert tracked(task, reference, at.replace(**{field: value})) == pytest.approx(expected)
+    # Where the base is costs nothing by itself: feet are seen from it, and the CoM is given.
+    ahead = at.replace(base_position=at.base_position + 0.5, feet=at.feet + 0.5)
+    assert tracked(task, reference, ahead) == pytest.approx(1.0)
+
+
+def test_a_turned_robot_loses_only_its_orientation(
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    """Yaw by 0.2 rad: 0.65 exp(-2 x 0.04) + 0.35, since feet are in the heading frame."""
+    task, reference = make("laikago_trot"), naive_reference("laikago_trot")
+    qpos = reference.qpos[40].copy()
+    qpos[3:7] = [math.cos(0.1), 0.0, 0.0, math.sin(0.1)]
+    at = on_reference(task, reference, 40, qpos)
+    at = at.replace(com=reference.com[[40]])
+    assert tracked(task, reference, at) == pytest.approx(0.65 * 0.9231163 + 0.35)
+    # Roll is not heading: it also shows in the feet.
+    qpos[3:7] = [math.cos(0.1), math.sin(0.1), 0.0, 0.0]
+    rolled = on_reference(task, reference, 40, qpos).replace(com=reference.com[[40]])
+    assert tracked(task, reference, rolled) < 0.65 * 0.9231163 + 0.33
+
+
+def test_tracking_ends_at_a_fall(naive_reference: Callable[[str], ReferenceMotion]) -> None:
+    task = make("laikago_trot")
+    terminal = task.tracker(naive_reference("laikago_trot")).terminal
+
+    def tilted(degrees: float, axis: int) -> tuple[float, ...]:
+        half = math.radians(degrees) / 2
+        vector = [0.0, 0.0, 0.0]
+        vector[axis] = math.sin(half)
+        return (math.cos(half), *vector)
+
+    for axis in (0, 1):
+        assert not terminal(state(orientation=tilted(89.0, axis)))[0]
+        assert terminal(state(orientation=tilted(91.0, axis)))[0]
+        assert terminal(state(orientation=tilted(-91.0, axis)))[0]
+    assert not terminal(state(orientation=tilted(179.0, 2)))[0]
+    assert terminal(state(com_height=0.3199))[0]
+    assert not terminal(state(base=(3.78, 0.0, 0.42)))[0]  # the goal is no ending
+
+
+def test_imitation_starts_along_the_reference(
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    task, reference = make("laikago_trot"), naive_reference("laikago_trot")
+    start = task.tracker(reference).start(np.random.default_rng(0), 4000)
+    frames = np.rint(start.time * 30).astype(int)
+    np.testing.assert_allclose(start.time, frames * STEP)
+    assert (frames.min(), frames.max()) == (0, reference.steps - 1)
+    later = frames > 0
+    assert 0.70 < later.mean() < 0.80  # the others begin as evaluation does
+    difference = start.qpos[later] - reference.qpos[frames[later]]
+    assert np.abs(difference[:, 7:]).max() <= 0.025 * (1 + 1e-9)
+    assert np.abs(difference[:, :2]).max() < 1e-12
+    difference = start.qvel[later] - reference.qvel[frames[later]]
+    assert np.abs(difference[:, :3]).max() <= 0.05 * (1 + 1e-9)
+    assert np.abs(difference[:, 3:]).max() <= 0.1 * (1 + 1e-9)
+    np.testing.assert_allclose(start.memory, np.tile(start.qpos[:, 7:] - NOMINAL, 4))
+
+
+def test_no_other_imitation_reward(naive_reference: Callable[[str], ReferenceMotion]) -> None:
+    with pytest.raises(TsbenchError, match=r"'progress'; allowed: deepmimic"):
+        make("laikago_trot").tracker(naive_reference("laikago_trot"), "progress")
+
+
+# Rotations, against scipy
+
+
+def test_rotations() -> None:
+    rng = np.random.default_rng(0)
+    first, second = Rotation.random(50, rng=rng), Rotation.random(50, rng=rng)
+    p, q = (rotation.as_quat(scalar_first=True) for rotation in (first, second))
+    product = Rotation.from_quat(laikago.multiply(p, q), scalar_first=True)
+    np.testing.assert_allclose(product.as_matrix(), (first * second).as_matrix(), atol=1e-12)
+    angle = (first.inv() * second).magnitude()
+    np.testing.assert_allclose(laikago.angle_between(p, q), angle, atol=1e-7)
+    np.testing.assert_allclose(laikago.angle_between(p, -q), angle, atol=1e-7)
+    np.testing.assert_allclose(laikago.upward(p), first.as_matrix()[:, 2, 2], atol=1e-12)
+    # In the heading frame the base's own x axis has no y component.
+    forward = first.as_matrix()[:, None, :, 0]
+    heading = laikago.to_heading(forward, p)[:, 0]
+    np.testing.assert_allclose(heading[:, 1], 0.0, atol=1e-12)
+    assert np.all(heading[:, 0] >= 0.0)
+    np.testing.assert_allclose(heading[:, 2], forward[:, 0, 2], atol=1e-12)

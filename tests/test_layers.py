@@ -1,0 +1,156 @@
+"""Imports run downwards only, and heavy packages stay in their rooms."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import tsbench
+
+ROOT = Path(tsbench.__file__).parent
+
+# What each room may know, lowest first; a room is a package or a file beside the packages.
+# `problem` is what a method is given; `rl` and `methods` both stand on it.
+MAY_KNOW: dict[str, set[str]] = {
+    "errors": set(),
+    "gl": set(),
+    "curves": set(),
+    "conf": set(),
+    "planning": {"errors"},
+    "typed": {"errors"},
+    "motion": {"errors"},
+    "policy": {"errors", "typed"},
+    "mdp": {"motion", "errors"},
+    "problem": {"mdp"},
+    "sim": {"errors", "motion", "mdp"},
+    "tasks": {"errors", "motion", "mdp", "sim", "planning"},
+    "evaluation": {"errors", "mdp", "policy", "sim"},
+    "rl": {"errors", "typed", "mdp", "policy", "problem", "sim"},
+    "methods": {"errors", "typed", "motion", "mdp", "policy", "problem", "sim", "planning", "rl"},
+    "viewer": {"errors", "motion", "mdp", "policy", "sim", "evaluation"},
+    "config": {"errors", "typed", "problem"},
+    "record": {"errors", "typed", "mdp", "policy", "tasks", "config"},
+    "bench": {"errors", "mdp", "sim", "tasks"},
+    "tables": {"record", "bench"},
+    "workspace": {"record", "tables"},
+    "run": {
+        "errors", "mdp", "motion", "policy", "problem", "sim", "tasks", "evaluation", "rl",
+        "methods", "viewer", "config", "record", "tables", "workspace", "curves",
+    },
+    "launch": {"errors", "config", "run"},
+}  # fmt: skip
+ROOFS = {"cli", "tsbench"}  # the commands, and the public face: they may know everything
+
+ONLY_IN: dict[str, set[str]] = {
+    "torch": {"rl"},
+    "rsl_rl": {"rl"},
+    "tensordict": {"rl"},
+    "mink": {"planning"},
+    "dm_control": {"sim", "tsbench"},
+    "dm_env": {"sim"},
+    "mujoco": {"mdp", "planning", "sim", "tasks", "viewer", "bench", "cli"},
+    "safetensors": {"policy"},
+    "hydra": {"config", "launch"},
+    "omegaconf": {"config", "launch"},
+    "meshcat": {"viewer"},
+    "matplotlib": {"curves"},
+    "tensorboard": {"workspace"},
+    "rich": {"tables", "workspace", "run", "cli", "launch"},
+}
+STARTS_FAST = {"tsbench", "cli", "launch"}  # where an import may wait until it is needed
+
+
+def room(module: str) -> str:
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "tsbench"
+
+
+def modules() -> Iterator[tuple[str, ast.Module]]:
+    for path in sorted(ROOT.rglob("*.py")):
+        relative = path.relative_to(ROOT.parent).with_suffix("")
+        yield ".".join(relative.parts).removesuffix(".__init__"), ast.parse(path.read_text("utf-8"))
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            module = node.module or ""
+            if module == "tsbench":  # from tsbench import tasks
+                yield from (f"tsbench.{alias.name}" for alias in node.names)
+            else:
+                yield module
+
+
+MODULES = dict(modules())
+
+
+def ours(name: str) -> set[str]:
+    found = {name for name in imported(MODULES[name]) if name.split(".")[0] == "tsbench"}
+    # A name that is no module was taken from the package itself: from tsbench import load.
+    return {name if room(name) in MAY_KNOW.keys() | ROOFS else "tsbench" for name in found}
+
+
+def test_the_table_has_an_order() -> None:
+    tuple(TopologicalSorter(MAY_KNOW).static_order())
+    assert set().union(*MAY_KNOW.values()) <= MAY_KNOW.keys()
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_run_downwards(name: str) -> None:
+    own = room(name)
+    if own in ROOFS:
+        return
+    assert own in MAY_KNOW, f"{name} has no place among the rooms"
+    strangers = {other for other in ours(name) if room(other) not in MAY_KNOW[own] | {own}}
+    assert not strangers
+
+
+def test_no_circles_within_a_room() -> None:
+    graph = {name: ours(name) & MODULES.keys() - {name} for name in MODULES}
+    tuple(TopologicalSorter(graph).static_order())
+
+
+def test_tasks_and_methods_do_not_know_their_like() -> None:
+    """A new one is one file; the package's own file finds it without knowing its name."""
+    for package in ("tsbench.tasks", "tsbench.methods"):
+        files = {name for name in MODULES if name.startswith(f"{package}.")}
+        assert len(files) >= 2
+        for name in (package, *files):
+            assert not ours(name) & files, name
+
+
+def test_heavy_packages_stay_in_their_rooms() -> None:
+    for name, tree in MODULES.items():
+        for package in {other.split(".")[0] for other in imported(tree)} & ONLY_IN.keys():
+            assert room(name) in ONLY_IN[package], f"{name} imports {package}"
+
+
+def test_imports_stand_at_the_top() -> None:
+    """A function-level import hides a circle, or makes a start fast where that matters."""
+    for name, tree in MODULES.items():
+        functions = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.Lambda))]
+        inner = [other for function in functions for other in imported(function)]
+        assert not inner or room(name) in STARTS_FAST, f"{name} imports {inner} in a function"
+
+
+def test_evaluation_needs_no_learning() -> None:
+    """Nor does anything else of the public face load torch."""
+    program = (
+        "import sys, tsbench, tsbench.evaluation.evaluate, tsbench.policy, tsbench.methods\n"
+        "tsbench.load('rocket_navigation').reset()\n"
+        "print(*sorted({'torch', 'rsl_rl', 'hydra', 'meshcat'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT.parent
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

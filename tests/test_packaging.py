@@ -1,0 +1,113 @@
+"""What is shipped, what is pinned, and what `make` hands on."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tsbench import methods, tasks
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def project() -> dict[str, Any]:
+    return dict(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"])
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built wheel, unpacked."""
+    folder = tmp_path_factory.mktemp("wheel")
+    words = ["-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (built,) = folder.glob("*.whl")
+    with zipfile.ZipFile(built) as archive:
+        archive.extractall(folder / "unpacked")
+    return folder / "unpacked"
+
+
+def test_the_wheel_holds_the_data(wheel: Path) -> None:
+    package = wheel / "tsbench"
+    for name in ("rocket.xml", "laikago.xml"):
+        assert (package / "models" / name).read_bytes() == (ROOT / "models" / name).read_bytes()
+    assert (package / "leaderboards" / "README.md").is_file()
+    assert (package / "viewer" / "page.html").is_file()
+    assert {path.stem for path in (package / "conf" / "task").iterdir()} == set(tasks.names())
+    assert {path.stem for path in (package / "conf" / "method").iterdir()} == set(methods.names())
+    assert not (wheel / "tests").exists()
+
+
+def test_the_wheel_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    program = f"""
+import sys
+sys.path.insert(0, {str(wheel)!r})
+import tsbench
+from tsbench import cli
+from tsbench.sim.model import model_path
+for name in ("rocket", "laikago"):
+    assert {str(wheel)!r} in str(model_path(name)), model_path(name)
+sys.exit(cli.main(["list"]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "rocket_navigation" in done.stdout
+
+
+def normalised(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_requirement_is_pinned(project: dict[str, Any]) -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {normalised(line.split("==")[0]) for line in lines if "==" in line}
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    assert {normalised(re.split(r"[<>=]", item)[0]) for item in wanted} <= pinned
+
+
+def test_pins_name_no_local_build() -> None:
+    assert "+" not in (ROOT / "constraints.txt").read_text()
+
+
+def made(*words: str) -> list[str]:
+    """The words of the last command that `make` would run."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
+    done = subprocess.run(
+        ["make", "--dry-run", *words], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return shlex.split(done.stdout.splitlines()[-1])
+
+
+def test_make_run_is_the_main_job() -> None:
+    assert made("run") == [".venv/bin/tsbench", "run", "task=laikago_trot"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["task=rocket_navigation", "method=twostage", "budget=smoke"],
+        ["task=rocket_navigation", "task.training.plan.hidden=[64, 64]", "seed=range(0,3)"],
+        ["task=rocket_navigation", "directory=it's mine/${seed}", "+task.constants.x=1"],
+        ["task=rocket_navigation", r"directory=back\slash", "method.imitation=null"],
+    ],
+)
+def test_make_run_hands_its_words_on(words: list[str]) -> None:
+    assert sorted(made("run", *words)[2:]) == sorted(words)
+
+
+def test_make_run_takes_other_words_in_args() -> None:
+    words = made("run", "ARGS=-m seed=0,1", "task=rocket_navigation", "PYTHON=python3")
+    assert words[2:] == ["task=rocket_navigation", "-m", "seed=0,1"]

@@ -1,0 +1,376 @@
+"""One run, end to end: what its directory holds, and that it can be trusted later."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from tsbench import cli, config, launch, record, run, tables, tasks
+from tsbench.errors import TsbenchError
+from tsbench.motion import Plan, ReferenceMotion
+from tsbench.policy import Policy
+from tsbench.workspace import RunWorkspace, Stage
+
+WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512", "seed=3"]
+
+
+def execute(directory: Path, words: list[str] = WORDS) -> str:
+    """Makes a run and returns what it showed."""
+    chosen = replace(config.compose(words), directory=str(directory))
+    with (directory.parent / "out").open("w+") as file:
+        run.execute(chosen, words, Console(file=file, width=100))
+        file.seek(0)
+        return file.read()
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A finished run's directory, and what was shown meanwhile. Not to be changed."""
+    directory = tmp_path_factory.mktemp("runs") / "one"
+    return directory, execute(directory)
+
+
+@pytest.fixture
+def finished(shown: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A finished run to play with, below the current directory."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(shown[0], "one")
+    return Path("one")
+
+
+def test_the_directory_holds_everything(shown: tuple[Path, str]) -> None:
+    assert {path.name for path in shown[0].iterdir()} == {
+        "config.yaml",
+        "learning_curves.png",
+        "log.txt",
+        "metrics.jsonl",
+        "plan.npz",
+        "policy.json",
+        "policy.safetensors",
+        "reference.npz",
+        "score.json",
+        "tensorboard",
+        "versions.json",
+        "view.html",
+    }
+
+
+def test_the_config_repeats_the_run(shown: tuple[Path, str]) -> None:
+    directory, _ = shown
+    text = (directory / "config.yaml").read_text()
+    assert text.startswith(f"# tsbench run {' '.join(WORDS)}\n")
+    composed = replace(config.compose(WORDS), directory=str(directory))
+    assert record.read_config(directory) == composed
+    assert yaml.safe_load(text)["seed"] == 3
+
+
+def test_versions_and_hashes(shown: tuple[Path, str]) -> None:
+    content = json.loads((shown[0] / "versions.json").read_text())
+    assert content["packages"]["mujoco"] == version("mujoco")
+    assert content["packages"]["rsl-rl-lib"] == version("rsl-rl-lib")
+    policy = Policy.load(shown[0])
+    assert content["physics"] == {"rocket_navigation": policy.info.physics}
+
+
+def test_the_score_says_what_each_stage_used(shown: tuple[Path, str]) -> None:
+    content = record.read_score(shown[0])
+    assert (content["task"], content["method"]) == ("rocket_navigation", "twostage")
+    assert content["standard"] is True
+    assert 0.0 <= content["score"]["normalized_reward"] <= 1.0
+    plan, imitate = content["stages"]
+    assert (plan["name"], imitate["name"]) == ("plan", "imitate")
+    assert plan["budget"] == 512 <= plan["steps"]
+    assert imitate["budget"] <= imitate["steps"]
+    assert plan["physics_substeps"] == 0
+    substeps = tasks.make("rocket_navigation").substeps
+    assert imitate["physics_substeps"] >= imitate["steps"] * substeps
+    assert plan["seconds"] > 0.0
+
+
+def test_metrics_are_the_same_in_both_places(shown: tuple[Path, str]) -> None:
+    lines = (shown[0] / "metrics.jsonl").read_text().splitlines()
+    rows = [json.loads(line) for line in lines]
+    assert {row["stage"] for row in rows} == {"plan", "imitate"}
+    events = EventAccumulator(str(shown[0] / "tensorboard"))
+    events.Reload()
+    for stage in ("plan", "imitate"):
+        steps = [row["steps"] for row in rows if row["stage"] == stage]
+        assert steps == sorted(set(steps))
+        losses = [row["value_loss"] for row in rows if row["stage"] == stage]
+        scalars = events.Scalars(f"{stage}/value_loss")
+        assert [scalar.step for scalar in scalars] == steps
+        assert np.allclose([scalar.value for scalar in scalars], losses)
+
+
+def test_the_learning_curves_are_a_picture(shown: tuple[Path, str]) -> None:
+    assert (shown[0] / "learning_curves.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+
+def test_the_table_tells_the_score_the_cost_and_where_to_look(shown: tuple[Path, str]) -> None:
+    directory, text = shown
+    for words in (
+        "rocket_navigation, twostage, seed 3, budget smoke",
+        "normalized_reward",
+        "optimality",
+        "success",
+        "100 perturbed starts",
+        f"tsbench evaluate {directory}",
+        f"{directory / 'view.html'}",
+    ):
+        assert words in text
+    assert "plan:" in (directory / "log.txt").read_text()
+
+
+def test_nothing_but_what_is_ours_is_shown(shown: tuple[Path, str]) -> None:
+    assert "rsl" not in shown[1].lower()
+    assert len(shown[1].splitlines()) < 60
+
+
+def test_the_same_seed_gives_the_same_bits(finished: Path, tmp_path: Path) -> None:
+    execute(tmp_path / "two")
+    for name in ("policy.safetensors", "policy.json"):
+        assert (finished / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    first, second = record.read_score(finished), record.read_score(tmp_path / "two")
+    assert first["score"] == second["score"]
+    one, two = Plan.load(finished / "plan.npz"), Plan.load(tmp_path / "two" / "plan.npz")
+    np.testing.assert_array_equal(one.states, two.states)
+
+
+def test_a_used_directory_is_refused_and_stays(finished: Path) -> None:
+    before = (finished / "score.json").read_bytes()
+    with pytest.raises(TsbenchError, match="one holds a finished run and nothing is overwritten"):
+        execute(finished)
+    assert (finished / "score.json").read_bytes() == before
+
+
+def test_evaluate_repeats_the_score(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["evaluate", "one", "--json", "again.json"]) == 0
+    assert "equal to one/score.json" in capsys.readouterr().out
+    assert json.loads(Path("again.json").read_text()) == record.read_score(finished)["score"]
+
+
+def test_evaluate_needs_the_policy_file_alone(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("bare").mkdir()
+    for name in ("policy.json", "policy.safetensors"):
+        shutil.copy(finished / name, "bare")
+    assert cli.main(["evaluate", "bare", "--json", "bare.json"]) == 0
+    assert "score.json" not in capsys.readouterr().out
+    assert json.loads(Path("bare.json").read_text()) == record.read_score(finished)["score"]
+
+
+def test_evaluate_says_when_a_score_is_not_what_the_policy_earns(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = record.read_score(finished)
+    content["score"]["normalized_reward"] = 0.99
+    (finished / "score.json").write_text(json.dumps(content))
+    assert cli.main(["evaluate", "one"]) == 0
+    assert "DIFFERENT from one/score.json" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("finished")
+def test_evaluate_with_other_starts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["evaluate", "one", "--episodes", "7", "--seed", "5"]) == 0
+    out = capsys.readouterr().out
+    assert "7 perturbed starts" in out
+    assert "score.json" not in out
+
+
+@pytest.mark.usefixtures("finished")
+def test_view_writes_a_page_once(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["view", "one", "--html", "page.html"]) == 0
+    page = Path("page.html").read_text()
+    assert "rocket_navigation, twostage, seed 3, budget smoke" in page
+    capsys.readouterr()
+    assert cli.main(["view", "one", "--html", "page.html"]) == 2
+    assert "page.html exists" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("finished")
+def test_a_table_in_json_is_written_once(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["evaluate", "one", "--json", "one/score.json"]) == 2
+    line = "tsbench: one/score.json exists and nothing is overwritten\n"
+    assert capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize("content", [b"", b"rubbish", b"\x00" * 100, b"{}", b"[1]", b"{"])
+@pytest.mark.parametrize(
+    ("verb", "name"),
+    [
+        ("evaluate", "policy.json"),
+        ("evaluate", "policy.safetensors"),
+        ("evaluate", "config.yaml"),
+        ("evaluate", "score.json"),
+        ("view", "policy.json"),
+        ("view", "reference.npz"),
+        ("view", "score.json"),
+    ],
+)
+@pytest.mark.usefixtures("finished")
+def test_a_damaged_file_is_named(
+    verb: str, name: str, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (Path("one") / name).write_bytes(content)
+    words = {"evaluate": ["--episodes", "1"], "view": ["--html", "page.html"]}
+    if name == "score.json" and verb == "evaluate":
+        words = {"evaluate": []}
+    assert cli.main([verb, "one", *words[verb]]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("tsbench: ")
+    assert f"one/{name}" in error
+    assert error.count("\n") == 1
+    assert not Path("page.html").exists()
+
+
+def test_truncated_recordings_are_named(finished: Path) -> None:
+    for kind, name in ((Plan, "plan.npz"), (ReferenceMotion, "reference.npz")):
+        path = finished / name
+        path.write_bytes(path.read_bytes()[:-200])
+        with pytest.raises(TsbenchError, match=f"one/{name}"):
+            kind.load(path)
+
+
+def test_a_policy_is_refused_where_it_does_not_belong(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = json.loads((finished / "policy.json").read_text())
+    info["task"] = "laikago_trot"
+    (finished / "policy.json").write_text(json.dumps(info))
+    assert cli.main(["evaluate", "one"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("size", [600, 30_000, 300_000])
+def test_a_full_disk_stops_a_run_in_one_line(size: int, tmp_path: Path) -> None:
+    """No file may grow beyond `size` bytes: the system's refusal at different places of a run."""
+    program = (
+        "import resource, sys\n"
+        "from tsbench.cli import main\n"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))\n"
+        f"sys.exit(main(['run', *{WORDS!r}, 'directory=mine']))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("tsbench: ")
+    assert "mine" in done.stderr
+    assert "File too large" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "mine" / "score.json").exists()
+
+
+def test_a_run_that_cannot_begin_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise TsbenchError("this method cannot do this task")
+
+    monkeypatch.setattr("tsbench.methods.twostage.train", refuse)
+    with pytest.raises(TsbenchError, match="cannot do this task"):
+        execute(tmp_path / "mine")
+    assert not (tmp_path / "mine").exists()
+
+
+def test_a_run_that_fails_later_keeps_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tsbench.curves.draw", fail)
+    with pytest.raises(TsbenchError, match=r"mine: No space left on device"):
+        execute(tmp_path / "mine")
+    assert (tmp_path / "mine" / "policy.safetensors").exists()
+    assert not (tmp_path / "mine" / "score.json").exists()
+
+
+def test_changed_constants_are_recorded(tmp_path: Path) -> None:
+    words = [*WORDS, "task.constants.distance=20.0", "method=monolithic"]
+    execute(tmp_path / "near", words)
+    content = record.read_score(tmp_path / "near")
+    assert content["standard"] is False
+    assert [stage["name"] for stage in content["stages"]] == ["train"]
+    policy, task = record.read_policy(tmp_path / "near")
+    assert task == tasks.make("rocket_navigation", distance=20.0)
+    assert policy.info.method == "monolithic"
+
+
+def test_a_sweep_goes_on_after_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["tsbench"])
+    words = ["run", "-m", *WORDS[:3], "seed=0,1"]
+    taken = launch.directory(config.compose(WORDS[:3]), WORDS[:3])
+    taken.mkdir(parents=True)
+    assert cli.main(words) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 2
+    assert "nothing is overwritten" in errors[0]
+    assert errors[1] == "tsbench: 1 of the sweep's runs failed (see above)"
+    other = Path(str(taken).replace("seed0", "seed1"))
+    assert record.read_score(other)["seed"] == 1
+
+
+def test_the_standard_directory() -> None:
+    chosen = config.compose(WORDS)
+    assert launch.directory(chosen, ["task=rocket_navigation", "seed=3", "budget=smoke"]) == Path(
+        "runs/rocket_navigation/twostage/seed3-smoke"
+    )
+    words = ["++task.training.plan.hidden=[64, 64]", "method.finetune=0.2", "threads=1"]
+    name = "seed3-smoke,task.training.plan.hidden=_64_64_,method.finetune=0.2"
+    assert launch.directory(chosen, words).name == name
+    assert len(launch.directory(chosen, 20 * words).name) < 255
+
+
+def test_a_stage_on_a_terminal_and_elsewhere(tmp_path: Path) -> None:
+    shown = {}
+    for terminal in (True, False):
+        with (tmp_path / "out").open("w+") as file:
+            workspace = RunWorkspace(tmp_path, Console(file=file, force_terminal=terminal))
+            with workspace.stage("plan", 100) as monitor:
+                for steps in range(10, 101, 10):
+                    monitor.update(steps, {"episode_return": 2.5, "value_loss": math.nan})
+            workspace.close()
+            file.seek(0)
+            shown[terminal] = file.read()
+    assert "━" in shown[True]
+    assert "\x1b" not in shown[False]
+    assert "plan        50%  reward 2.5, " in shown[False]
+    for text in shown.values():
+        assert "plan: 100 steps in 0:00, reward 2.5, " in text
+    row = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[0])
+    assert row.keys() == {"stage", "steps", "seconds", "episode_return"}
+
+
+def test_numbers_as_people_read_them() -> None:
+    assert tables.duration(59.6) == "1:00"
+    assert tables.duration(3725.0) == "1:02:05"
+    assert tables.number(None) == tables.number(math.inf) == "-"
+    assert tables.number(0.123456) == "0.1235"
+    assert tables.number(12) == "12"
+
+
+def test_stages_are_plain_values() -> None:
+    assert set(asdict(Stage("plan", 1))) == {
+        "name",
+        "budget",
+        "steps",
+        "physics_substeps",
+        "seconds",
+    }
