@@ -381,10 +381,13 @@ def along(forward: float, left: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("position", "expected"),
     [
-        (along(20.0, 2.0), 0.2865047969 * 0.4),  # exp(-0.625 x 2) (0.1 + 0.9 / 3)
-        (along(20.03, -2.0), 0.2865047969 * 0.40045),  # between two vertices
-        (along(0.0, 0.0), 0.1),
-        (along(-3.0, 0.0), 0.1533549623 * 0.1),  # exp(-0.625 x 3), behind the start
+        # exp(-0.625 x 2) (0.1 + 0.5 / 3 + 0.4 exp(-4))
+        (along(20.0, 2.0), 0.2865047969 * (0.2666666667 + 0.4 * 0.01831563889)),
+        # between two vertices: 0.5 x 20.03 / 60, exp(-3.997)
+        (along(20.03, -2.0), 0.2865047969 * (0.2669166667 + 0.4 * 0.01837066832)),
+        (along(0.0, 0.0), 0.1 + 0.4 * 0.002478752177),  # exp(-6)
+        # exp(-0.625 x 3), behind the start
+        (along(-3.0, 0.0), 0.1533549623 * (0.1 + 0.4 * 0.002478752177)),
         (along(60.0, 0.0), 1.0),
         (along(64.0, 0.0), 0.0820849986),  # exp(-0.625 x 4), past the goal
     ],

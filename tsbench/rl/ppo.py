@@ -47,6 +47,9 @@ class PPOSettings:
     hidden: sizes of the hidden layers of actor and critic.
     activation: between the layers.
     initial_std: of the Gaussian policy, per unit of action.
+    final_std: what it is held below at the end of a stage, by a bound that falls geometrically
+        from `initial_std`; None for no bound. Where actions have dead zones, a policy can live on
+        its own noise, and its mean alone then fails.
     bootstrap: whether an episode's last step counts as if it went on.
     """
 
@@ -66,6 +69,7 @@ class PPOSettings:
     hidden: tuple[int, ...] = (256, 128)
     activation: str = "elu"
     initial_std: float = 1.0
+    final_std: float | None = None
     bootstrap: bool = True
 
     def __post_init__(self) -> None:
@@ -75,6 +79,8 @@ class PPOSettings:
         for name in ("learning_rate", "gradient_norm", "initial_std", "clip"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        if self.final_std is not None and not 0.0 < self.final_std <= self.initial_std:
+            raise ValueError("final_std must be positive and at most initial_std, or null")
         for name in ("entropy", "value_weight"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
@@ -179,6 +185,7 @@ class Learner:
             collected = time.perf_counter()
             losses = ppo.update()
             self.steps += env.num_envs * self.settings.rollout
+            self._bound_std(min(self.steps / end, 1.0))
             if report is not None:
                 metrics = {
                     "collect_seconds": collected - started,
@@ -191,6 +198,13 @@ class Learner:
                     metrics["episode_return"] = float(np.mean(self._returns))
                     metrics["episode_length"] = float(np.mean(self._lengths))
                 report(self.steps, metrics)
+
+    def _bound_std(self, share: float) -> None:
+        """Holds the policy's spread below its bound after a share of the stage."""
+        first, last = self.settings.initial_std, self.settings.final_std
+        if last is not None:
+            with torch.no_grad():
+                self._ppo.actor.distribution.std_param.clamp_(max=first * (last / first) ** share)
 
     def _count(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
         self._return += rewards.numpy()

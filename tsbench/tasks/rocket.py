@@ -33,6 +33,7 @@ PLAN_TURN = 0.05  # rad per plan step (P prints degrees; D: see spec section 1)
 
 TRACKING_DECAY = -0.625  # k_imi (P)
 COLLISION_PENALTY = 0.25  # (P)
+ARRIVAL_LENGTH = 10.0  # m, over which arriving is felt (D)
 
 DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
 MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
@@ -341,9 +342,11 @@ class Rocket(Task[RocketState]):
         """Rewards for following the reference's path, whatever the time.
 
         `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
-        `progress` (default): the same with the sparse R replaced by 0.1 + 0.9 s / L, where s of
-        the path's length L lies before xbar. The printed form is itself sparse when the goal is
-        far (docs/calibration.md) (D).
+        `progress` (default): the same with the sparse R replaced by
+        0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 10 m), where s of the path's length L lies before
+        xbar (D). The printed form is itself sparse when the goal is far. Without the exponential
+        the last metres are worth about 1 % each, less than what leaving a steady hover costs, and
+        policies stop some metres short (docs/calibration.md).
         """
         form = self.imitation_form(form)
         remaining = np.linalg.norm(reference.qpos[:, :2] - self.goal, axis=-1)
@@ -356,7 +359,8 @@ class Rocket(Task[RocketState]):
             if form == "paper":
                 worth = self.reward(previous, action, state)
             else:
-                worth = 0.1 + 0.9 * progress
+                remaining = (1.0 - progress) * path.lengths[-1]
+                worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / ARRIVAL_LENGTH)
             collision = xp.astype(self.violated(state), state.position.dtype)
             return xp.exp(TRACKING_DECAY * distance) * worth - COLLISION_PENALTY * collision
 
