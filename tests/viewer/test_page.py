@@ -288,7 +288,7 @@ class Browser:
             *("--hide-scrollbars", "--enable-logging=stderr", f"--user-data-dir={profile}"),
             *("--force-device-scale-factor=1", f"--window-size={WIDTH},{HEIGHT}", *flags, url),
         ]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         spoken = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
         # Of Chromium's own, about taking the picture.
         unexpected = [line for line in spoken if "GPU stall due to ReadPixels" not in line]
