@@ -33,7 +33,7 @@ PLAN_TURN = 0.05  # rad per plan step (P prints degrees; D: see spec section 1)
 
 TRACKING_DECAY = -0.625  # k_imi (P)
 COLLISION_PENALTY = 0.25  # (P)
-ARRIVAL_LENGTH = 10.0  # m, over which arriving is felt (D)
+ARRIVAL_LENGTH = 4.0  # m, over which arriving is felt (D)
 
 DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
 MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
@@ -343,7 +343,7 @@ class Rocket(Task[RocketState]):
 
         `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
         `progress` (default): the same with the sparse R replaced by
-        0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 10 m), where s of the path's length L lies before
+        0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 4 m), where s of the path's length L lies before
         xbar (D). The printed form is itself sparse when the goal is far. Without the exponential
         the last metres are worth about 1 % each, less than what leaving a steady hover costs, and
         policies stop some metres short (docs/calibration.md).
