@@ -12,7 +12,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar, cast
 
 import mujoco
 import numpy as np
@@ -252,7 +252,5 @@ class Task(MDP[S]):
 
     def constants(self) -> dict[str, Any]:
         """The values that define the task; a score made with others cannot be ranked."""
-        return {
-            f.name: getattr(self, f.name)
-            for f in dataclasses.fields(self)  # type: ignore[arg-type]
-        }
+        fields = dataclasses.fields(cast(Any, self))  # every task is a dataclass
+        return {field.name: getattr(self, field.name) for field in fields}
