@@ -280,8 +280,11 @@ class Browser:
     folder: Path
 
     def run(self, url: str, *flags: str) -> str:
-        """Opens the address and returns what Chromium printed. On a busy machine Chromium's virtual time now and then stands still
-        for good before a page is drawn: it is stopped and asked again, a few times."""
+        """Opens the address and returns what Chromium printed.
+
+        On a busy machine Chromium's virtual time now and then stands still for good before a page
+        is drawn: it is stopped and asked again, a few times.
+        """
         for _ in range(TRIES):
             try:
                 printed, spoken = self._run(url, *flags)
