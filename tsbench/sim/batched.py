@@ -1,9 +1,10 @@
 """Many episodes of one MDP at once.
 
 The physics runs on `mujoco.batch`, which steps every simulation on a pool of threads that is as
-wide as the machine and then brings position and velocity sensors up to date. Measured on two
-cores with Laikago (`tsbench bench`), it is as fast as the bare `mujoco.rollout` loop, which leaves
-the sensors one substep behind and needs an extra step to mend that.
+wide as the machine and then brings position and velocity sensors up to date. The bare
+`mujoco.rollout` leaves them one substep behind, and mending that takes an extra step. With
+observations, rewards and resets this does 0.91 of the bare rollout's control steps per second on
+Laikago, two cores (`tsbench bench`).
 """
 
 from __future__ import annotations
