@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -62,6 +63,10 @@ def test_forward_by_hand() -> None:
     # Actions stay in the box.
     assert tiny(np.array([100.0, 100.0])).tolist() == [1.0]
     assert relu(np.array([1.0, -1.0])).tolist() == [0.375]
+    # symlog(e^2 - 1) = 2 and symlog(1 - e^2) = -2
+    symlog = replace(tiny, info=replace(tiny.info, encoding="symlog"))
+    observation = np.array([math.e**2 - 1.0, 1.0 - math.e**2])
+    np.testing.assert_allclose(symlog(observation), [-0.1384349], atol=1e-6)
 
 
 def actor(layers: tuple[int, ...], activation: str, seed: int) -> MLPModel:
@@ -223,6 +228,7 @@ def test_a_truncated_description(saved: Path) -> None:
         ({"activation": "eluu"}, ["unknown activation", "did you mean 'elu'?"]),
         ({"activation": ["elu"]}, ["activation"]),
         ({"activation": None}, ["activation"]),
+        ({"encoding": "simlog"}, ["unknown encoding", "did you mean 'symlog'?"]),
         ({"layers": [5, 16, 8]}, ["policy.safetensors", "weight_2"]),
         ({"layers": [5, 16, 8, 2, 2]}, ["weight_3"]),
         ({"layers": [6, 16, 8, 2]}, ["shapes do not fit"]),

@@ -37,6 +37,20 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+def _plain(x: np.ndarray) -> np.ndarray:
+    return x
+
+
+def _symlog(x: np.ndarray) -> np.ndarray:
+    return np.sign(x) * np.log1p(np.abs(x))
+
+
+# What is done to observations before they are normalised. Where some range over tens of metres and
+# centimetres still matter, as a rocket's way to its goal, `symlog` (Hafner et al. 2023, DreamerV3)
+# spreads the small values apart; a linear scale would leave them to a tenth of the network's input.
+ENCODINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"plain": _plain, "symlog": _symlog}
+
+
 @dataclass(frozen=True)
 class PolicyInfo:
     """What `policy.json` says.
@@ -49,6 +63,7 @@ class PolicyInfo:
         activation: between layers, a name in `ACTIVATIONS`.
         layers: sizes from observation to action.
         sha256: of `policy.safetensors`.
+        encoding: of observations before they are normalised, a name in `ENCODINGS`.
         format: of these files.
     """
 
@@ -59,6 +74,7 @@ class PolicyInfo:
     activation: str
     layers: tuple[int, ...]
     sha256: str = ""
+    encoding: str = "plain"
     format: int = FORMAT
 
 
@@ -68,7 +84,7 @@ class Policy:
 
     Attributes:
         info: where it comes from.
-        mean: of the observations in training, shape (n,), float32.
+        mean: of the encoded observations in training, shape (n,), float32.
         scale: what deviations from the mean are divided by, shape (n,), float32.
         weights: of each layer, shape (outputs, inputs), float32.
         biases: of each layer, shape (outputs,), float32.
@@ -92,7 +108,7 @@ class Policy:
 
     def _forward(self, x: np.ndarray) -> np.ndarray:
         activation = ACTIVATIONS[self.info.activation]
-        x = (x - self.mean) / self.scale
+        x = (ENCODINGS[self.info.encoding](x) - self.mean) / self.scale
         last = len(self.weights) - 1
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = weight @ x + bias
@@ -169,6 +185,8 @@ def _read_info(path: Path) -> PolicyInfo:
         raise TsbenchError(f"{path} has format {info.format}; this tsbench reads {FORMAT}")
     if info.activation not in ACTIVATIONS:
         raise unknown(f"activation in {path}", str(info.activation), ACTIVATIONS)
+    if info.encoding not in ENCODINGS:
+        raise unknown(f"encoding in {path}", str(info.encoding), ENCODINGS)
     if len(info.layers) < 2 or min(info.layers) < 1:
         raise TsbenchError(f"damaged policy file {path}: layers {info.layers}")
     return info

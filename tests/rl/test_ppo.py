@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 
 from tsbench import TsbenchError, tasks
 from tsbench.motion import ReferenceMotion
-from tsbench.policy import Policy
+from tsbench.policy import ENCODINGS, Policy
 from tsbench.problem import Budget, Problem
 from tsbench.rl.ppo import Learner, PPOSettings
 from tsbench.rl.stages import settings
@@ -152,13 +153,14 @@ def test_going_on_with_another_reward() -> None:
     assert bits(second.policy(task, "test")) != bits(first.policy(task, "test"))
 
 
-def test_the_artefact_is_the_actor() -> None:
-    taught = learner()
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_artefact_is_the_actor(encoding: str) -> None:
+    taught = learner(replace(TINY, encoding=encoding))
     taught.learn(256)
     policy = taught.policy(tasks.make("rocket_navigation", distance=3.0), "test")
     assert policy.info.layers == (7, 16, 3)
     assert (policy.info.task, policy.info.method) == ("rocket_navigation", "test")
-    environment = TorchEnvironment(taught.environment)
+    environment = TorchEnvironment(taught.environment, encoding)
     actor = taught._ppo.actor
     actor.eval()
     with torch.inference_mode():
@@ -235,6 +237,7 @@ def test_settings() -> None:
         ({"discount": 1.01}, r"discount must lie in \[0, 1\]"),
         ({"gae_lambda": -0.1}, r"gae_lambda must lie in \[0, 1\]"),
         ({"activation": "selu"}, r"activation must be one of elu, relu, tanh"),
+        ({"encoding": "log"}, r"encoding must be one of plain, symlog"),
         ({"clip": -0.2}, r"clip"),
         ({"desired_kl": 0.0}, r"desired_kl"),
         ({"entropy": float("inf")}, r"entropy"),

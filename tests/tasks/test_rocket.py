@@ -399,7 +399,25 @@ def test_progress_reward(straight: ReferenceMotion, position: Any, expected: flo
     assert tracker.reward(at, action, at)[0] == pytest.approx(expected, rel=1e-6)
     hit = state(position, clearance=(-0.1, 3.0))
     assert tracker.reward(hit, action, hit)[0] == pytest.approx(expected - 0.25, rel=1e-6)
-    assert tracker.max_reward == 1.0
+    assert tracker.max_reward == 1.5
+
+
+@pytest.mark.parametrize(
+    ("before", "advance"),
+    [
+        (along(19.9, 0.0), 0.1),
+        (along(20.2, 1.0), -0.2),  # backwards, whatever the distance from the path
+        (along(15.0, 0.0), 0.5),  # faster than any rocket: a corner of the path was cut
+        (along(25.0, 0.0), -0.5),
+    ],
+)
+def test_advancing_is_paid_by_the_metre(
+    straight: ReferenceMotion, before: Any, advance: float
+) -> None:
+    tracker = rocket().tracker(straight)
+    at, action = state(along(20.0, 2.0)), np.zeros((1, 2))
+    standing = tracker.reward(at, action, at)[0]
+    assert tracker.reward(state(before), action, at)[0] == pytest.approx(standing + advance)
 
 
 def test_the_papers_imitation_reward(straight: ReferenceMotion) -> None:

@@ -20,7 +20,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
 from tsbench.mdp import Task
-from tsbench.policy import ACTIVATIONS, Policy, PolicyInfo
+from tsbench.policy import ACTIVATIONS, ENCODINGS, Policy, PolicyInfo
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.model import fingerprint
@@ -46,6 +46,7 @@ class PPOSettings:
     gradient_norm: that gradients are clipped to.
     hidden: sizes of the hidden layers of actor and critic.
     activation: between the layers.
+    encoding: of observations before they are normalised, a name in `policy.ENCODINGS`.
     initial_std: of the Gaussian policy, per unit of action.
     final_std: what it is held below at the end of a stage, by a bound that falls geometrically
         from `initial_std`; None for no bound. Where actions have dead zones, a policy can live on
@@ -68,6 +69,7 @@ class PPOSettings:
     gradient_norm: float = 1.0
     hidden: tuple[int, ...] = (256, 128)
     activation: str = "elu"
+    encoding: str = "plain"
     initial_std: float = 1.0
     final_std: float | None = None
     bootstrap: bool = True
@@ -95,6 +97,8 @@ class PPOSettings:
             raise ValueError(f"minibatches are {self.minibatches}, more than the steps collected")
         if self.activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}")
+        if self.encoding not in ENCODINGS:
+            raise ValueError(f"encoding must be one of {', '.join(ENCODINGS)}")
 
 
 class Learner:
@@ -116,7 +120,7 @@ class Learner:
         torch.manual_seed(seed)
         self.settings = settings
         self.environment = environment
-        self._env = TorchEnvironment(environment)
+        self._env = TorchEnvironment(environment, settings.encoding)
         self.steps = 0
         self._returns: deque[float] = deque(maxlen=100)
         self._lengths: deque[int] = deque(maxlen=100)
@@ -228,6 +232,7 @@ class Learner:
                 physics=fingerprint(task.spec()),
                 method=method,
                 activation=self.settings.activation,
+                encoding=self.settings.encoding,
                 layers=(weights[0].shape[1], *(weight.shape[0] for weight in weights)),
             ),
             mean=normaliser.mean.numpy().copy(),

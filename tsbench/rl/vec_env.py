@@ -9,19 +9,22 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from tsbench.policy import ENCODINGS
 from tsbench.sim.batched import BatchedEnvironment
 
 
 class TorchEnvironment(VecEnv):
-    """Float32 tensors on the CPU over a batched environment.
+    """Float32 tensors on the CPU over a batched environment, its observations encoded.
 
     Attributes:
         cfg: nothing; rsl-rl asks for it.
     """
 
-    def __init__(self, environment: BatchedEnvironment[Any]) -> None:
+    def __init__(self, environment: BatchedEnvironment[Any], encoding: str = "plain") -> None:
+        """`encoding` is a name in `policy.ENCODINGS`."""
         mdp = environment.mdp
         self.environment = environment
+        self._encode = ENCODINGS[encoding]
         self.num_envs = environment.count
         self.num_actions = mdp.action_size
         self.max_episode_length = mdp.horizon
@@ -50,6 +53,6 @@ class TorchEnvironment(VecEnv):
     def _tensors(self, observation: np.ndarray) -> TensorDict:
         environment = self.environment
         value = environment.mdp.value_observation(environment.state)
-        groups = {"policy": observation, "value": value}
-        tensors = {name: torch.from_numpy(group).float() for name, group in groups.items()}
+        encoded = {"policy": self._encode(observation), "value": self._encode(value)}
+        tensors = {name: torch.from_numpy(group).float() for name, group in encoded.items()}
         return TensorDict(tensors, batch_size=[self.num_envs])

@@ -34,6 +34,8 @@ PLAN_TURN = 0.05  # rad per plan step (P prints degrees; D: see spec section 1)
 TRACKING_DECAY = -0.625  # k_imi (P)
 COLLISION_PENALTY = 0.25  # (P)
 ARRIVAL_LENGTH = 4.0  # m, over which arriving is felt (D)
+ADVANCE_WORTH = 1.0  # per metre that a step brings along the reference (C)
+ADVANCE_LIMIT = 0.5  # m a step: free fall at full thrust, 25 m/s, comes no further
 
 DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
 MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
@@ -344,9 +346,12 @@ class Rocket(Task[RocketState]):
         `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
         `progress` (default): the same with the sparse R replaced by
         0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 4 m), where s of the path's length L lies before
-        xbar (D). The printed form is itself sparse when the goal is far. Without the exponential
-        the last metres are worth about 1 % each, less than what leaving a steady hover costs, and
-        policies stop some metres short (docs/calibration.md).
+        xbar, and 1 for each metre by which the step raised s (D). The printed form is itself
+        sparse when the goal is far. Without the exponential the last metres are worth about 1 %
+        each, less than what leaving a steady hover costs, and without the pay for advancing the
+        same holds on the way: policies stop some metres short, or are slow (docs/calibration.md).
+        What a detour gains it loses again, so the pay changes no policy's rank (Ng et al. 1999,
+        potential-based shaping, without the discount).
         """
         form = self.imitation_form(form)
         remaining = np.linalg.norm(reference.qpos[:, :2] - self.goal, axis=-1)
@@ -356,13 +361,17 @@ class Rocket(Task[RocketState]):
         def reward(previous: RocketState, action: Array, state: RocketState) -> Array:
             xp = array_namespace(state.position)
             distance, progress = path.project(state.position)
-            if form == "paper":
-                worth = self.reward(previous, action, state)
-            else:
-                remaining = (1.0 - progress) * path.lengths[-1]
-                worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / ARRIVAL_LENGTH)
             collision = xp.astype(self.violated(state), state.position.dtype)
-            return xp.exp(TRACKING_DECAY * distance) * worth - COLLISION_PENALTY * collision
+            penalty = COLLISION_PENALTY * collision
+            closeness = xp.exp(TRACKING_DECAY * distance)
+            if form == "paper":
+                return closeness * self.reward(previous, action, state) - penalty
+            length = path.lengths[-1]
+            remaining = (1.0 - progress) * length
+            worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / ARRIVAL_LENGTH)
+            advance = (progress - path.project(previous.position)[1]) * length
+            advance = xp.clip(advance, -ADVANCE_LIMIT, ADVANCE_LIMIT)
+            return closeness * worth + ADVANCE_WORTH * advance - penalty
 
         def start(rng: Rng, count: int) -> Start:
             # More often near the goal, where to stay pays and an early policy does not get.
@@ -379,7 +388,7 @@ class Rocket(Task[RocketState]):
 
         return Tracker(
             reward=reward,
-            max_reward=GOAL_WEIGHT if form == "paper" else 1.0,
+            max_reward=GOAL_WEIGHT if form == "paper" else 1.0 + ADVANCE_WORTH * ADVANCE_LIMIT,
             terminal=self.terminal,
             start=start,
             horizon=self.horizon,
