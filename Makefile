@@ -14,6 +14,7 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
+EXTRAS := $(VENV)/.extras
 PYTHON ?= $(firstword $(foreach name,python3.12 python3.11 python3,\
 	$(shell $(name) -c 'import sys; (3, 11) <= sys.version_info < (3, 13) and print("$(name)")' 2>/dev/null)))
 ARGS ?=
@@ -42,6 +43,11 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
+# What the benchmark compares with, which a run does not need.
+$(EXTRAS): $(STAMP)
+	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev,bench]'
+	@touch $@
+
 run: setup
 	@$(BIN)/tsbench run $(words) $(ARGS)
 
@@ -49,10 +55,10 @@ run: setup
 system:
 	@.ci/debian libosmesa6 chromium
 
-test: setup system
+test: setup system $(EXTRAS)
 	$(BIN)/python -m pytest --numprocesses=auto $(ARGS)
 
-check: setup
+check: setup $(EXTRAS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -61,7 +67,7 @@ format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: setup
+bench: setup $(EXTRAS)
 	@$(BIN)/tsbench bench $(ARGS)
 
 clean:

@@ -45,12 +45,13 @@ MAY_KNOW: dict[str, set[str]] = {
     },
     "launch": {"errors", "config", "run"},
 }  # fmt: skip
-ROOFS = {"cli", "tsbench"}  # the commands, and the public face: they may know everything
+ROOFS = {"cli", "gym", "tsbench"}  # the commands and the public faces: they may know everything
 
 ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl"},
     "rsl_rl": {"rl"},
     "tensordict": {"rl"},
+    "gymnasium": {"sim", "gym"},
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},
     "dm_env": {"sim"},

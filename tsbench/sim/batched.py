@@ -91,20 +91,25 @@ class Physics(Generic[S]):
 
 
 @dataclass(frozen=True)
-class Transition:
-    """What a step gave; shapes (n,) but for the observation.
+class Transition(Generic[S]):
+    """What a step gave; shapes (n,) unless said otherwise.
 
     Attributes:
-        observation: of the state that follows; where an episode ended, of the next one's start.
+        observation: of the state that follows, shape (n, observation_size); where an episode
+            ended, of the next one's start.
         reward: of the step.
         terminal: the episode ended for a reason other than its last step.
         truncated: the episode ended with its last step.
+        ended: the rows of either kind of ending, shape (k,).
+        final: the states that those episodes ended in, k of them.
     """
 
     observation: np.ndarray
     reward: np.ndarray
     terminal: np.ndarray
     truncated: np.ndarray
+    ended: np.ndarray
+    final: S
 
 
 class BatchedEnvironment(Generic[S]):
@@ -131,7 +136,7 @@ class BatchedEnvironment(Generic[S]):
         observation: np.ndarray = self.mdp.observation(self.state)
         return observation
 
-    def step(self, action: np.ndarray) -> Transition:
+    def step(self, action: np.ndarray) -> Transition[S]:
         """One time step of all episodes; `action` has shape (n, action_size)."""
         previous = self.state
         state = self.dynamics.advance(previous, action)
@@ -140,9 +145,11 @@ class BatchedEnvironment(Generic[S]):
         terminal = self.mdp.terminal(state)
         truncated = (self.steps >= self.mdp.horizon) & ~terminal
         ended = np.flatnonzero(terminal | truncated)
+        final = state.rows(ended)
         if len(ended):
             fresh = self.dynamics.begin(self.rng, ended)
             self.steps[ended] = np.rint(fresh.time / self.mdp.timestep).astype(int)
             state = state.updated(ended, fresh)
         self.state = state
-        return Transition(self.mdp.observation(state), reward, terminal, truncated)
+        observation = self.mdp.observation(state)
+        return Transition(observation, reward, terminal, truncated, ended, final)
