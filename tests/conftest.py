@@ -10,29 +10,16 @@ from functools import cache
 # by side, and threads that wait for each other's cores slow a small network down tenfold.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numpy as np
 import pytest
 
 from tsbench import tasks
 from tsbench.motion import Plan, ReferenceMotion
-from tsbench.sim.kinematic import Planning
+from tsbench.sim.kinematic import Planning, plan_by_hand
 
 
 @cache
 def _naive_plan(name: str) -> Plan:
-    task = tasks.make(name)
-    planning = Planning(task)
-    abstraction = planning.abstraction
-    state = abstraction.start(1)
-    states = [abstraction.flatten(state)[0]]
-    rewards: list[float] = []
-    while len(rewards) < planning.horizon and not planning.terminal(state)[0]:
-        action = abstraction.naive(state)
-        following = planning.advance(state, action)
-        rewards.append(planning.reward(state, action, following)[0])
-        states.append(abstraction.flatten(following)[0])
-        state = following
-    return Plan(name, task.version, planning.timestep, np.array(states), np.array(rewards))
+    return plan_by_hand(Planning(tasks.make(name)))
 
 
 @cache

@@ -36,14 +36,17 @@ MAY_KNOW: dict[str, set[str]] = {
     "viewer": {"errors", "motion", "mdp", "policy", "sim", "evaluation"},
     "config": {"errors", "typed", "problem"},
     "record": {"errors", "typed", "mdp", "policy", "tasks", "config"},
-    "bench": {"errors", "mdp", "sim", "tasks"},
-    "tables": {"record", "bench"},
+    "tables": {"record"},
     "workspace": {"record", "tables"},
     "run": {
         "errors", "mdp", "motion", "policy", "problem", "sim", "tasks", "evaluation", "rl",
         "methods", "viewer", "config", "record", "tables", "workspace", "curves",
     },
     "launch": {"errors", "config", "run"},
+    "bench": {
+        "errors", "mdp", "motion", "problem", "sim", "tasks", "rl", "methods", "config", "record",
+        "workspace", "run",
+    },
 }  # fmt: skip
 ROOFS = {"cli", "gym", "tsbench"}  # the commands and the public faces: they may know everything
 
@@ -51,7 +54,7 @@ ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl"},
     "rsl_rl": {"rl"},
     "tensordict": {"rl"},
-    "gymnasium": {"sim", "gym"},
+    "gymnasium": {"sim", "gym", "bench"},
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},
     "dm_env": {"sim"},
@@ -62,7 +65,7 @@ ONLY_IN: dict[str, set[str]] = {
     "meshcat": {"viewer"},
     "matplotlib": {"curves"},
     "tensorboard": {"workspace"},
-    "rich": {"tables", "workspace", "run", "cli", "launch"},
+    "rich": {"tables", "workspace", "run", "cli", "launch", "bench"},
 }
 STARTS_FAST = {"tsbench", "cli", "launch"}  # where an import may wait until it is needed
 

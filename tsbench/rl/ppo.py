@@ -177,6 +177,7 @@ class Learner:
         end = self.steps + steps
         while self.steps < end:
             started = time.perf_counter()
+            before = (self.environment.seconds, self.environment.dynamics.seconds)
             with torch.inference_mode():
                 for _ in range(self.settings.rollout):
                     actions = ppo.act(observation)
@@ -193,6 +194,8 @@ class Learner:
             if report is not None:
                 metrics = {
                     "collect_seconds": collected - started,
+                    "environment_seconds": self.environment.seconds - before[0],
+                    "physics_seconds": self.environment.dynamics.seconds - before[1],
                     "update_seconds": time.perf_counter() - collected,
                     "value_loss": losses["value"],
                     "learning_rate": ppo.learning_rate,

@@ -10,6 +10,7 @@ Laikago, two cores (`tsbench bench`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, Generic, Protocol
 
 import mujoco
@@ -23,7 +24,13 @@ _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class Dynamics(Protocol[S]):
-    """What turns actions into states, for a fixed number of episodes."""
+    """What turns actions into states, for a fixed number of episodes.
+
+    Attributes:
+        seconds: spent in a physics engine so far, wall-clock.
+    """
+
+    seconds: float
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         """Starts new episodes in `rows` and returns their states."""
@@ -38,6 +45,7 @@ class Physics(Generic[S]):
     Attributes:
         batch: the simulations; a write to `batch.xfrc_applied` pushes them.
         substeps: physics steps done so far, all episodes together.
+        seconds: spent in MuJoCo so far, wall-clock.
     """
 
     def __init__(
@@ -47,6 +55,7 @@ class Physics(Generic[S]):
         self.task = task
         self.perturbed = perturbed
         self.substeps = 0
+        self.seconds = 0.0
         spec = task.spec()
         spec.compiler.discardvisual = True  # 10 % faster, the same states to the last bit
         model = spec.compile()
@@ -63,16 +72,20 @@ class Physics(Generic[S]):
     def place(self, rows: np.ndarray, start: Start) -> S:
         """Puts the simulations in `rows` where `start` says and returns their states."""
         ids = np.asarray(rows, np.int32)
+        began = perf_counter()
         self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self._qpos[rows] = start.qpos
         self._qvel[rows] = start.qvel
         self.batch.forward(ids, stage=_CURRENT)
+        self.seconds += perf_counter() - began
         return self._read(rows, start.time, start.memory)
 
     def advance(self, state: S, action: Array) -> S:
         control, memory = self.task.control(state, action)
         self._ctrl[:] = control
+        began = perf_counter()
         self.batch.step(nstep=self.task.substeps, stage=_CURRENT)
+        self.seconds += perf_counter() - began
         self.substeps += len(control) * self.task.substeps
         return self._read(slice(None), state.time + self.task.timestep, memory)
 
@@ -119,6 +132,7 @@ class BatchedEnvironment(Generic[S]):
         state: of all episodes.
         steps: steps taken in each episode since its start, shape (n,). An episode that starts
             along a reference motion starts with the steps that lie before.
+        seconds: spent in `step` so far, wall-clock.
     """
 
     def __init__(self, mdp: MDP[S], dynamics: Dynamics[S], count: int, seed: int) -> None:
@@ -128,6 +142,7 @@ class BatchedEnvironment(Generic[S]):
         self.rng = np.random.default_rng(seed)
         self.state: S
         self.steps = np.zeros(count, int)
+        self.seconds = 0.0
 
     def reset(self) -> np.ndarray:
         """Starts all episodes; returns the observations, shape (n, observation_size)."""
@@ -138,6 +153,7 @@ class BatchedEnvironment(Generic[S]):
 
     def step(self, action: np.ndarray) -> Transition[S]:
         """One time step of all episodes; `action` has shape (n, action_size)."""
+        began = perf_counter()
         previous = self.state
         state = self.dynamics.advance(previous, action)
         self.steps += 1
@@ -152,4 +168,5 @@ class BatchedEnvironment(Generic[S]):
             state = state.updated(ended, fresh)
         self.state = state
         observation = self.mdp.observation(state)
+        self.seconds += perf_counter() - began
         return Transition(observation, reward, terminal, truncated, ended, final)

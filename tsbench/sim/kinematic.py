@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from tsbench.mdp import MDP, Array, Rng, S, Task
+from tsbench.motion import Plan
 
 
 class Planning(MDP[S]):
@@ -13,6 +16,8 @@ class Planning(MDP[S]):
     The reward is the task's own times the abstraction's `dynamics_reward`, so there is no second
     reward that could drift away from the first.
     """
+
+    seconds = 0.0  # in a physics engine: there is none
 
     def __init__(self, task: Task[S], *, explore: float = 0.0) -> None:
         """`explore` is the share of episodes that begin at a sampled state instead of the start:
@@ -62,3 +67,24 @@ class Planning(MDP[S]):
 
     def advance(self, state: S, action: Array) -> S:
         return self.abstraction.advance(state, action)
+
+
+def plan_by_hand(planning: Planning[Any]) -> Plan:
+    """The plan that the abstraction's hand-made planner makes."""
+    abstraction = planning.abstraction
+    state = abstraction.start(1)
+    states = [abstraction.flatten(state)[0]]
+    rewards: list[float] = []
+    while len(rewards) < planning.horizon and not planning.terminal(state)[0]:
+        action = abstraction.naive(state)
+        following = planning.advance(state, action)
+        rewards.append(planning.reward(state, action, following)[0])
+        states.append(abstraction.flatten(following)[0])
+        state = following
+    return Plan(
+        task=planning.name,
+        task_version=planning.version,
+        timestep=planning.timestep,
+        states=np.array(states),
+        rewards=np.array(rewards),
+    )
