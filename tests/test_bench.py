@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tsbench import bench, tasks
-from tsbench.bench import Comparison, Findings, stepping
+from tsbench.bench import Comparison, Findings, sb3, stepping
 from tsbench.bench.training import split
 from tsbench.bench.turns import Case, Effort, Range, take_turns
 from tsbench.cli import main
@@ -25,6 +25,8 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("QUICK", "FULL"):
         monkeypatch.setattr(bench, name, TINY)
     monkeypatch.setattr(stepping, "RECORDED", 3)
+    monkeypatch.setattr(sb3, "PATIENCE", 0.0)
+    monkeypatch.setattr(sb3, "PROCESSES", 2)
 
 
 @pytest.mark.parametrize("name", bench.names())

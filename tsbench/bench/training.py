@@ -35,7 +35,7 @@ def compare(effort: Effort) -> Findings:
         for stage in ("plan", "imitate"):
             chosen = settings(problem, stage)
             steps = chosen.environments * chosen.rollout
-            rows = train(problem, stage, steps * (effort.iterations + 1))[1:]  # the first allocates
+            rows = train(problem, stage, steps * (effort.iterations + 1))
             findings.add(split(f"{name}.{stage}", rows, steps))
     return findings
 
@@ -56,7 +56,8 @@ def train(problem: Problem, stage: str, steps: int) -> list[dict[str, float]]:
 
 
 def split(name: str, rows: list[dict[str, float]], steps: int) -> Findings:
-    """Shares of the time of iterations of that many steps; `rows` also tell when each ended."""
+    """Shares of the time of iterations of that many steps, but for the first, which allocates:
+    an iteration's record tells when it ended."""
     whole = np.diff([row["seconds"] for row in rows])
     collect, update, environment, physics = (
         np.array([row[f"{part}_seconds"] for row in rows[1:]])

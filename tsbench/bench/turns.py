@@ -84,9 +84,10 @@ def take_turns(cases: Sequence[Case], effort: Effort) -> Rates:
         case.steps()  # the first one allocates
     for _ in range(effort.repeats):
         for case in cases:
-            done, began = 0, time.perf_counter()
-            while (elapsed := time.perf_counter() - began) < effort.seconds:
+            done, elapsed, began = 0, 0.0, time.perf_counter()
+            while not done or elapsed < effort.seconds:
                 done += case.steps()
+                elapsed = time.perf_counter() - began
             turns[case.name].append(done / elapsed)
     for case in cases:
         case.close()
