@@ -16,6 +16,18 @@ class TsbenchError(Exception):
     """
 
 
+class Stopped(KeyboardInterrupt):
+    """A signal has stopped the run: Ctrl-C, or SIGTERM.
+
+    Attributes:
+        signal: its number. The exit status is 128 more, as a shell counts.
+    """
+
+    def __init__(self, signal: int, message: str = "interrupted") -> None:
+        super().__init__(message)
+        self.signal = signal
+
+
 def unknown(kind: str, given: str, allowed: Iterable[str]) -> TsbenchError:
     """The error for a name that does not exist, with the nearest one that does.
 
@@ -41,3 +53,15 @@ def os_errors(path: Path | str) -> Iterator[None]:
         yield
     except OSError as error:
         raise TsbenchError(f"{error.filename or path}: {error.strerror or error}") from None
+
+
+@contextmanager
+def memory_errors() -> Iterator[None]:
+    """Turns a refusal of memory, by Python, numpy, mujoco or torch, into one line."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        # torch raises a plain RuntimeError.
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
+            raise
+        raise TsbenchError("out of memory: fewer environments need less") from None

@@ -24,7 +24,8 @@ from tsbench.errors import TsbenchError
 RUNS = Path("runs")
 LONGEST_NAME = 200  # characters; file systems allow 255 bytes
 CHECKED_JOBS = 1000  # of a sweep; later ones are checked when their turn comes
-PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads")
+PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads", "checkpoint")
+RESUME = "resume="
 OWN_SEARCH_PATH = ("config_path", "config_name", "config_dir", "experimental_rerun")
 NO_JOB = ("shell_completion", "hydra_help", "info")
 
@@ -38,6 +39,11 @@ def launch(words: Sequence[str]) -> None:
     parser = get_args_parser()
     parser.error = _refuse
     flags = parser.parse_intermixed_args(list(words))
+    if any(word.startswith(RESUME) for word in words):
+        if len(words) > 1:
+            raise TsbenchError("resume=RUN goes on with the run's own configuration: give it alone")
+        run.resume(Path(words[0].removeprefix(RESUME)))
+        return
     if not any(getattr(flags, name) for name in (*OWN_SEARCH_PATH, *NO_JOB)):
         jobs = config.sweep(flags.overrides) if flags.multirun else [list(flags.overrides)]
         for job in islice(jobs, CHECKED_JOBS):
@@ -56,6 +62,8 @@ def launch(words: Sequence[str]) -> None:
         chosen = config.parse(node)
         chosen = replace(chosen, directory=chosen.directory or str(directory(chosen, given)))
         try:
+            if flags.multirun:
+                return run.complete(chosen, given)
             return run.execute(chosen, given).normalized_reward
         except TsbenchError as error:
             if os.getpid() != parent:  # a launcher's worker: the failure has to travel back

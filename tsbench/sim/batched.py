@@ -9,6 +9,7 @@ Laikago, two cores (`tsbench bench`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol
 
@@ -30,6 +31,16 @@ class Dynamics(Protocol[S]):
 
     def advance(self, state: S, action: Array) -> S:
         """The states of all episodes one time step later."""
+
+
+class LastingDynamics(Dynamics[S], Protocol[S]):
+    """Dynamics that can be saved and go on later."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that it remembers between two calls: plain values and arrays."""
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from where `snapshot` was taken."""
 
 
 class Physics(Generic[S]):
@@ -76,6 +87,14 @@ class Physics(Generic[S]):
         self.substeps += len(control) * self.task.substeps
         return self._read(slice(None), state.time + self.task.timestep, memory)
 
+    def snapshot(self) -> dict[str, Any]:
+        # The rows of mjSTATE_INTEGRATION, from which mujoco continues to the last bit.
+        return {"simulations": self.batch.state, "substeps": self.substeps}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        self.batch.state[:] = snapshot["simulations"]
+        self.substeps = snapshot["substeps"]
+
     def _read(self, rows: Any, time: np.ndarray, memory: np.ndarray) -> S:
         # Copies: the batch's arrays change under whoever holds them.
         sensordata = self._sensordata[rows].copy()
@@ -116,7 +135,7 @@ class BatchedEnvironment(Generic[S]):
             along a reference motion starts with the steps that lie before.
     """
 
-    def __init__(self, mdp: MDP[S], dynamics: Dynamics[S], count: int, seed: int) -> None:
+    def __init__(self, mdp: MDP[S], dynamics: LastingDynamics[S], count: int, seed: int) -> None:
         self.mdp = mdp
         self.dynamics = dynamics
         self.count = count
@@ -146,3 +165,19 @@ class BatchedEnvironment(Generic[S]):
             state = state.updated(ended, fresh)
         self.state = state
         return Transition(self.mdp.observation(state), reward, terminal, truncated)
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that the next step depends on, but for the action: plain values and arrays."""
+        return {
+            "rng": self.rng.bit_generator.state,
+            "steps": self.steps,
+            "state": vars(self.state),
+            "dynamics": self.dynamics.snapshot(),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from where `snapshot` was taken; `reset` must have been called before."""
+        self.rng.bit_generator.state = snapshot["rng"]
+        self.steps = snapshot["steps"]
+        self.state = self.state.replace(**snapshot["state"])
+        self.dynamics.restore(snapshot["dynamics"])

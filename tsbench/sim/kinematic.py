@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from tsbench.mdp import MDP, Array, Rng, S, Task
@@ -62,3 +65,9 @@ class Planning(MDP[S]):
 
     def advance(self, state: S, action: Array) -> S:
         return self.abstraction.advance(state, action)
+
+    def snapshot(self) -> dict[str, Any]:
+        return {"explore": self.explore}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        self.explore = snapshot["explore"]
