@@ -45,7 +45,7 @@ MAY_KNOW: dict[str, set[str]] = {
         "errors", "files", "mdp", "motion", "policy", "problem", "sim", "tasks", "evaluation", "rl",
         "methods", "viewer", "config", "record", "tables", "workspace", "curves",
     },
-    "launch": {"errors", "config", "run"},
+    "launch": {"errors", "config", "record", "run"},
 }  # fmt: skip
 ROOFS = {"cli", "tsbench"}  # the commands, and the public face: they may know everything
 

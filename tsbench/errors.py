@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 
 class TsbenchError(Exception):
@@ -14,6 +16,18 @@ class TsbenchError(Exception):
     The message is one line in plain words. The command line prints it after `tsbench: ` on the
     error stream and exits with status 2; no traceback is shown.
     """
+
+
+class NotFiniteError(TsbenchError):
+    """A number that is not finite has turned up: the computation has gone wrong.
+
+    Attributes:
+        arrays: what it was computed from, by name, for whoever looks for the cause.
+    """
+
+    def __init__(self, message: str, arrays: Mapping[str, np.ndarray]) -> None:
+        super().__init__(message)
+        self.arrays = arrays
 
 
 class Stopped(KeyboardInterrupt):

@@ -56,10 +56,12 @@ class Monitor(Protocol):
 
     Attributes:
         physics_substeps: steps of the physics so far.
+        warnings: how often mujoco has warned so far, by mujoco's names.
         saved: the newest snapshot of this stage where a run is resumed, else None.
     """
 
     physics_substeps: int
+    warnings: dict[str, int]
 
     @property
     def saved(self) -> Snapshot | None: ...

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import io
 import json
 import os
 import platform
@@ -18,12 +19,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from rich.console import Console
 
 from tsbench import curves, methods, tables, tasks
 from tsbench.config import RunConfig
-from tsbench.errors import Stopped, TsbenchError, memory_errors, os_errors
+from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.evaluation.evaluate import Score, evaluate
 from tsbench.files import PART, write_whole
 from tsbench.motion import ReferenceMotion
@@ -32,6 +34,7 @@ from tsbench.record import (
     CHECKPOINTS,
     CONFIG,
     CURVES,
+    DUMP,
     METRICS,
     PAGE,
     REFERENCE,
@@ -213,10 +216,21 @@ def _explained(directory: Path) -> Iterator[None]:
     try:
         with os_errors(directory), memory_errors():
             yield
+    except NotFiniteError as error:
+        raise TsbenchError(f"{error}{_dumped(directory, error)}") from error
     except TsbenchError as error:
         raise TsbenchError(f"{error}{_way_on(directory)}") from error
     except Stopped as stopped:
         raise Stopped(stopped.signal, f"{stopped}{_way_on(directory)}") from None
+
+
+def _dumped(directory: Path, error: NotFiniteError) -> str:
+    """Keeps what the wrong number was computed from."""
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **error.arrays)
+    with os_errors(directory / DUMP):
+        write_whole(directory / DUMP, content.getvalue())
+    return f"; what it came from is in {directory / DUMP}"
 
 
 def _way_on(directory: Path) -> str:

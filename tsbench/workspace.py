@@ -39,6 +39,7 @@ class Stage:
         budget: environment steps it may use.
         steps: environment steps it has used.
         physics_substeps: steps of the physics under them; none in a kinematic stage.
+        warnings: how often mujoco warned meanwhile, by mujoco's names.
         seconds: wall-clock of the work that is in the result. What was lost when a run was
             interrupted, and the time until it was resumed, do not count.
         interruptions: how often the stage was resumed.
@@ -48,6 +49,7 @@ class Stage:
     budget: int
     steps: int = 0
     physics_substeps: int = 0
+    warnings: dict[str, int] = field(default_factory=dict)
     seconds: float = 0.0
     interruptions: int = 0
 
@@ -90,6 +92,14 @@ class RunMonitor:
     def physics_substeps(self, count: int) -> None:
         self.stage.physics_substeps = count
 
+    @property
+    def warnings(self) -> dict[str, int]:
+        return self.stage.warnings
+
+    @warnings.setter
+    def warnings(self, counts: dict[str, int]) -> None:
+        self.stage.warnings = counts
+
     def update(
         self,
         steps: int,
@@ -121,6 +131,7 @@ class Finished:
 
     saved: Snapshot | None
     physics_substeps: int = 0
+    warnings: dict[str, int] = field(default_factory=dict)
 
     def update(
         self,
@@ -250,6 +261,8 @@ class RunWorkspace:
             stage.seconds = time.perf_counter() - monitor.began
         self._learning = False
         self.note(f"{name}: {stage.steps:,} steps in {duration(stage.seconds)}{display.figures}")
+        for kind, count in stage.warnings.items():
+            self.note(f"{name}: mujoco warned {count:,} times of {kind}")
 
     def record(self, stage: Stage, metrics: Mapping[str, float]) -> None:
         """Appends an iteration's figures to `metrics.jsonl` and to the TensorBoard events."""

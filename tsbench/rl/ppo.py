@@ -19,7 +19,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
-from tsbench.errors import TsbenchError
+from tsbench.errors import NotFiniteError, TsbenchError
 from tsbench.mdp import Task
 from tsbench.policy import ACTIVATIONS, ENCODINGS, Policy, PolicyInfo
 from tsbench.rl.vec_env import TorchEnvironment
@@ -171,7 +171,11 @@ class Learner:
         )
 
     def learn(self, steps: int, report: Report | None = None) -> None:
-        """Goes on until `steps` environment steps have been taken in all, in whole iterations."""
+        """Goes on until `steps` environment steps have been taken in all, in whole iterations.
+
+        Raises:
+            NotFiniteError: a number in state, reward, action or loss is not finite.
+        """
         ppo, env = self._ppo, self._env
         ppo.train_mode()
         observation = env.get_observations()
@@ -188,6 +192,7 @@ class Learner:
                 ppo.compute_returns(observation)
             collected = time.perf_counter()
             losses = ppo.update()
+            self._expect_finite(losses)
             self.steps += env.num_envs * self.settings.rollout
             self._bound_std(min(self.steps / steps, 1.0))
             if report is not None:
@@ -202,6 +207,16 @@ class Learner:
                     metrics["episode_return"] = float(np.mean(self._returns))
                     metrics["episode_length"] = float(np.mean(self._lengths))
                 report(self.steps, metrics)
+
+    def _expect_finite(self, losses: Mapping[str, float]) -> None:
+        for name, loss in losses.items():
+            if not math.isfinite(loss):
+                storage = self._ppo.storage
+                names = ("actions", "rewards", "dones", "values", "returns", "advantages")
+                arrays = {name: getattr(storage, name).numpy() for name in names}
+                arrays |= _arrays(storage.observations.to_dict())
+                message = f"the {name} loss is not finite in the iteration after {self.steps} steps"
+                raise NotFiniteError(message, arrays)
 
     def _bound_std(self, share: float) -> None:
         """Holds the policy's spread below its bound after a share of the stage."""

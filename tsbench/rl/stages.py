@@ -84,6 +84,7 @@ def _reporting(learner: Learner, monitor: Monitor, physics: Physics[Any] | None 
     def report(steps: int, metrics: Mapping[str, float]) -> None:
         if physics is not None:
             monitor.physics_substeps = physics.substeps
+            monitor.warnings = physics.warned()
         monitor.update(steps, metrics, learner.snapshot)
 
     return report

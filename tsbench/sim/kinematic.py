@@ -56,6 +56,8 @@ class Planning(MDP[S]):
 
     # Its dynamics, for BatchedEnvironment
 
+    diverged = np.zeros(0, int)  # there is no physics that could
+
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         start = self.abstraction.start(len(rows))
         if not self.explore:
