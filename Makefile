@@ -2,11 +2,12 @@
 # make test     set up, then run the tests
 # make check    set up, then lint, format and types
 # make setup    the virtual environment .venv with the pinned packages
+# make faults   set up, then kill, starve and poison runs: N=50 kills, and every other fault once
 # make bench    speed of the batched simulation
 # make clean    remove what was made here, but not runs/
 #
 # `make run` hands all its key=value words to `tsbench run`; those in capitals are for make:
-# ARGS for other words, such as ARGS='-m seed=0,1', and PYTHON for the interpreter.
+# ARGS for other words, such as ARGS='-m seed=0,1', N for faults, and PYTHON for the interpreter.
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
@@ -25,10 +26,10 @@ empty :=
 space := $(empty) $(empty)
 plain = $(subst \\,\,$(subst $$$$,$$,$(subst <blank>,$(space),$1)))
 quoted = '$(subst ','\'',$(call plain,$1))'
-given = $(filter-out ARGS=% PYTHON=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
+given = $(filter-out ARGS=% PYTHON=% N=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
 words = $(if $(filter task=%,$(given)),,task=laikago_trot) $(foreach word,$(given),$(call quoted,$(word)))
 
-.PHONY: help setup system run test check format bench clean
+.PHONY: help setup system run test check format faults bench clean
 
 help:
 	@sed -n 's/^# \(make .*\)/  \1/p' Makefile
@@ -66,6 +67,10 @@ check: setup $(EXTRAS)
 format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+N ?= 50
+faults: setup
+	$(BIN)/python tests/faults.py --kills $(N) $(ARGS)
 
 bench: setup $(EXTRAS)
 	@$(BIN)/tsbench bench $(ARGS)

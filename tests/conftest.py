@@ -11,10 +11,15 @@ from functools import cache
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tsbench import tasks
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.sim.kinematic import Planning, plan_by_hand
+
+# How fast a machine is, or how busy, is no property of the code.
+settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any")
 
 
 @cache

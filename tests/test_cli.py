@@ -133,7 +133,7 @@ def test_an_existing_run_directory_is_refused(
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("precious")
     line = refusal(capsys, "run", TASK, "directory=mine")
-    assert "mine holds an unfinished run and nothing is overwritten" in line
+    assert "mine holds other files and nothing is overwritten" in line
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
 
 
@@ -199,5 +199,6 @@ def test_interrupted(tmp_path: Path) -> None:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (130, "tsbench: interrupted\n")
+    line = "tsbench: interrupted; to go on: tsbench run resume=mine\n"
+    assert (process.returncode, errors) == (130, line)
     assert not (tmp_path / "mine" / "score.json").exists()

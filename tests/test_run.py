@@ -318,6 +318,7 @@ def test_a_sweep_goes_on_after_a_failure(
     words = ["run", "-m", *WORDS[:3], "seed=0,1"]
     taken = launch.directory(config.compose(WORDS[:3]), WORDS[:3])
     taken.mkdir(parents=True)
+    (taken / "notes.txt").write_text("precious")
     assert cli.main(words) == 2
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 2
@@ -373,4 +374,5 @@ def test_stages_are_plain_values() -> None:
         "steps",
         "physics_substeps",
         "seconds",
+        "interruptions",
     }

@@ -15,7 +15,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from tsbench.errors import TsbenchError, unknown
+from tsbench.errors import Stopped, TsbenchError, unknown
 
 RUN_HELP = """\
 usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
@@ -29,6 +29,8 @@ words, in Hydra's grammar:
   seed=N           everything random comes from it (0)
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
+  checkpoint=S     seconds of training between checkpoints (30)
+  resume=RUN       goes on with an interrupted run, to the same bits; alone, without other words
   method.KEY=...   an option of the method
   task.training.STAGE.KEY=...
                    a PPO setting of the plan, imitate, finetune or task stages
@@ -62,13 +64,16 @@ class Verb:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command and returns the exit status: 0, 2 for a user's mistake, 130 for Ctrl-C."""
+    """Runs a command and returns the exit status: 0, 2 for a user's mistake, 130 for Ctrl-C,
+    143 for SIGTERM."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         _dispatch(words)
         sys.stdout.flush()
     except TsbenchError as error:
         return _fail(str(error), 2)
+    except Stopped as stopped:
+        return _fail(str(stopped), 128 + stopped.signal)
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
     except BrokenPipeError:  # the reader of the output has left: `tsbench list | head -1`

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from typing import Any
 
@@ -59,6 +59,7 @@ class RunConfig:
         budget: a name among the task's budgets.
         directory: the run directory, or None for the standard place.
         threads: CPU threads, or None for all.
+        checkpoint: seconds of training between checkpoints.
     """
 
     task: TaskConfig
@@ -67,6 +68,13 @@ class RunConfig:
     budget: str = "fast"
     directory: str | None = None
     threads: int | None = None
+    checkpoint: float = 30.0
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The part that decides what a run gives; the rest says where and with what."""
+        elsewhere = ("directory", "threads", "checkpoint")
+        return {name: value for name, value in asdict(self).items() if name not in elsewhere}
 
     def __post_init__(self) -> None:
         if not isinstance(self.method.get("name"), str):
@@ -75,6 +83,8 @@ class RunConfig:
             raise TsbenchError(f"seed must lie between 0 and {SEEDS - 1}, not {self.seed}")
         if self.threads is not None and self.threads < 1:
             raise TsbenchError(f"threads must be at least 1, not {self.threads}")
+        if not self.checkpoint >= 0.0:
+            raise TsbenchError(f"checkpoint must not be negative, not {self.checkpoint}")
         if self.budget not in self.task.budgets:
             raise unknown("budget", self.budget, self.task.budgets)
         for name, amount in vars(self.task.budgets[self.budget]).items():

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 
 class TsbenchError(Exception):
@@ -14,6 +16,30 @@ class TsbenchError(Exception):
     The message is one line in plain words. The command line prints it after `tsbench: ` on the
     error stream and exits with status 2; no traceback is shown.
     """
+
+
+class NotFiniteError(TsbenchError):
+    """A number that is not finite has turned up: the computation has gone wrong.
+
+    Attributes:
+        arrays: what it was computed from, by name, for whoever looks for the cause.
+    """
+
+    def __init__(self, message: str, arrays: Mapping[str, np.ndarray]) -> None:
+        super().__init__(message)
+        self.arrays = arrays
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal has stopped the run: Ctrl-C, or SIGTERM.
+
+    Attributes:
+        signal: its number. The exit status is 128 more, as a shell counts.
+    """
+
+    def __init__(self, signal: int, message: str = "interrupted") -> None:
+        super().__init__(message)
+        self.signal = signal
 
 
 def unknown(kind: str, given: str, allowed: Iterable[str]) -> TsbenchError:
@@ -41,3 +67,15 @@ def os_errors(path: Path | str) -> Iterator[None]:
         yield
     except OSError as error:
         raise TsbenchError(f"{error.filename or path}: {error.strerror or error}") from None
+
+
+@contextmanager
+def memory_errors() -> Iterator[None]:
+    """Turns a refusal of memory, by Python, numpy, mujoco or torch, into one line."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        # torch raises a plain RuntimeError.
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
+            raise
+        raise TsbenchError("out of memory: fewer environments need less") from None

@@ -6,6 +6,7 @@ import hashlib
 import os
 import re
 import sys
+import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
@@ -20,11 +21,13 @@ from omegaconf import DictConfig
 from tsbench import config, run
 from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError
+from tsbench.record import LOG
 
 RUNS = Path("runs")
 LONGEST_NAME = 200  # characters; file systems allow 255 bytes
 CHECKED_JOBS = 1000  # of a sweep; later ones are checked when their turn comes
-PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads")
+PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads", "checkpoint")
+RESUME = "resume="
 OWN_SEARCH_PATH = ("config_path", "config_name", "config_dir", "experimental_rerun")
 NO_JOB = ("shell_completion", "hydra_help", "info")
 
@@ -38,12 +41,17 @@ def launch(words: Sequence[str]) -> None:
     parser = get_args_parser()
     parser.error = _refuse
     flags = parser.parse_intermixed_args(list(words))
+    if any(word.startswith(RESUME) for word in words):
+        if len(words) > 1:
+            raise TsbenchError("resume=RUN goes on with the run's own configuration: give it alone")
+        run.resume(Path(words[0].removeprefix(RESUME)))
+        return
     if not any(getattr(flags, name) for name in (*OWN_SEARCH_PATH, *NO_JOB)):
         jobs = config.sweep(flags.overrides) if flags.multirun else [list(flags.overrides)]
         for job in islice(jobs, CHECKED_JOBS):
             run.prepare(config.compose(job))
 
-    failures: list[TsbenchError] = []
+    failures: list[tuple[str, Path, Exception]] = []
     parent = os.getpid()
 
     @hydra.main(
@@ -56,13 +64,19 @@ def launch(words: Sequence[str]) -> None:
         chosen = config.parse(node)
         chosen = replace(chosen, directory=chosen.directory or str(directory(chosen, given)))
         try:
-            return run.execute(chosen, given).normalized_reward
-        except TsbenchError as error:
-            if os.getpid() != parent:  # a launcher's worker: the failure has to travel back
-                raise
-            failures.append(error)
             if flags.multirun:
-                sys.stderr.write(f"tsbench: failed: {' '.join(given)}: {error}\n")
+                return run.complete(chosen, given)
+            return run.execute(chosen, given).normalized_reward
+        except Exception as error:
+            known = isinstance(error, TsbenchError)
+            # A launcher's worker has to let the failure travel back.
+            if os.getpid() != parent or not (known or flags.multirun):
+                raise
+            log = Path(chosen.directory or "") / LOG
+            if not known and log.exists():
+                with log.open("a", encoding="utf-8") as file:
+                    traceback.print_exc(file=file)
+            failures.append((" ".join(given), log, error))
             return float("nan")
 
     options = [word for word in words if word not in flags.overrides]
@@ -70,8 +84,12 @@ def launch(words: Sequence[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra lets exceptions through instead of printing them
     with config.one_line_errors():
         start()
-    if len(failures) == 1 and not flags.multirun:
-        raise failures[0]
+    if failures and not flags.multirun:
+        raise failures[0][2]
+    for name, log, error in failures:
+        where = f" (log: {log})" if log.exists() else ""
+        reason = str(error) if isinstance(error, TsbenchError) else repr(error)
+        sys.stderr.write(f"tsbench: failed: {name}: {reason}{where}\n")
     if failures:
         raise TsbenchError(f"{len(failures)} of the sweep's runs failed (see above)")
 

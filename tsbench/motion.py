@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import struct
 import zipfile
 import zlib
@@ -13,6 +14,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from tsbench.errors import TsbenchError
+from tsbench.files import write_whole
 
 # What numpy and zipfile raise on files that are not what they should be. RuntimeError covers
 # encrypted members and unknown compression methods.
@@ -56,11 +58,9 @@ class _Recording:
 
     def save(self, path: Path | str) -> None:
         """Writes the recording; the file appears whole or not at all."""
-        path = Path(path)
-        temporary = path.with_name(path.name + ".part")
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, kind=self.kind, **dataclasses.asdict(self))
-        temporary.replace(path)
+        content = io.BytesIO()
+        np.savez_compressed(content, kind=self.kind, **dataclasses.asdict(self))
+        write_whole(Path(path), content.getvalue())
 
     @classmethod
     def load(cls, path: Path | str) -> Self:

@@ -17,6 +17,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from tsbench.errors import TsbenchError, unknown
+from tsbench.files import write_whole
 from tsbench.typed import typed
 
 FORMAT = 1
@@ -125,8 +126,8 @@ class Policy:
             tensors[f"bias_{i}"] = np.ascontiguousarray(bias)
         content = save(tensors)
         info = asdict(self.info) | {"sha256": hashlib.sha256(content).hexdigest()}
-        _write(directory / "policy.safetensors", content)
-        _write(directory / "policy.json", (json.dumps(info, indent=2) + "\n").encode())
+        write_whole(directory / "policy.safetensors", content)
+        write_whole(directory / "policy.json", (json.dumps(info, indent=2) + "\n").encode())
 
     @classmethod
     def load(cls, directory: Path | str) -> Policy:
@@ -199,9 +200,3 @@ def _read(path: Path) -> bytes:
         raise TsbenchError(f"no policy file {path}") from None
     except OSError as error:
         raise TsbenchError(f"cannot read {path}: {error.strerror}") from None
-
-
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(content)
-    temporary.replace(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,17 +48,47 @@ class Problem:
     threads: int | None
 
 
+Snapshot = Mapping[str, Any]  # nested mappings of numpy arrays and of what JSON can hold
+
+
 class Monitor(Protocol):
-    """Takes a stage's figures, once per iteration."""
+    """Takes a stage's figures, once per iteration.
+
+    Attributes:
+        physics_substeps: steps of the physics so far.
+        warnings: how often mujoco has warned so far, by mujoco's names.
+        saved: the newest snapshot of this stage where a run is resumed, else None.
+    """
 
     physics_substeps: int
+    warnings: dict[str, int]
 
-    def update(self, steps: int, metrics: Mapping[str, float]) -> None:
-        """`steps`: environment steps of this stage so far."""
+    @property
+    def saved(self) -> Snapshot | None: ...
+
+    def update(
+        self,
+        steps: int,
+        metrics: Mapping[str, float],
+        snapshot: Callable[[], Snapshot] | None = None,
+    ) -> None:
+        """Takes an iteration's figures, and what to go on from should the run be interrupted.
+
+        Args:
+            steps: environment steps of this stage so far.
+            metrics: named scalars.
+            snapshot: gives all that the stage's next iteration depends on. It is called now and
+                then. A stage without one is done again when a run is resumed.
+        """
 
 
 class Workspace(Protocol):
-    """Where a method reports and leaves what it makes."""
+    """Where a method reports and leaves what it makes.
+
+    When a run is resumed, the method is called again from the top. Its stages get back what they
+    had `saved`, those that were finished their last state; what lies between them is done again,
+    so it must depend on nothing but the problem and the stages before.
+    """
 
     @property
     def directory(self) -> Path: ...

@@ -11,6 +11,7 @@ import yaml
 from tsbench import tasks
 from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError, os_errors
+from tsbench.files import write_whole
 from tsbench.mdp import Task
 from tsbench.policy import Policy
 from tsbench.typed import typed
@@ -19,9 +20,11 @@ CONFIG = "config.yaml"
 VERSIONS = "versions.json"
 METRICS = "metrics.jsonl"
 LOG = "log.txt"
-EVENTS = "tensorboard"
+EVENTS = "tensorboard/events.out.tfevents.0"
 PLAN = "plan.npz"
 REFERENCE = "reference.npz"
+DUMP = "not-finite.npz"
+CHECKPOINTS = "checkpoints"
 SCORE = "score.json"
 CURVES = "learning_curves.png"
 PAGE = "view.html"
@@ -87,9 +90,7 @@ def write_json(path: Path, content: Any) -> None:
     Raises:
         TsbenchError: the file exists or cannot be written.
     """
+    if path.exists():
+        raise TsbenchError(f"{path} exists and nothing is overwritten")
     with os_errors(path):
-        try:
-            with path.open("x", encoding="utf-8") as file:
-                file.write(json.dumps(content, indent=2) + "\n")
-        except FileExistsError:
-            raise TsbenchError(f"{path} exists and nothing is overwritten") from None
+        write_whole(path, (json.dumps(content, indent=2) + "\n").encode())

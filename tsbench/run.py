@@ -2,24 +2,48 @@
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
+import io
+import json
+import os
 import platform
 import shutil
+import signal
 import subprocess
-from collections.abc import Sequence
-from dataclasses import asdict
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
 from rich.console import Console
 
 from tsbench import curves, methods, tables, tasks
 from tsbench.config import RunConfig
-from tsbench.errors import TsbenchError, os_errors
+from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.evaluation.evaluate import Score, evaluate
+from tsbench.files import PART, write_whole
 from tsbench.motion import ReferenceMotion
 from tsbench.problem import Problem
-from tsbench.record import CONFIG, CURVES, METRICS, PAGE, REFERENCE, SCORE, VERSIONS, write_json
+from tsbench.record import (
+    CHECKPOINTS,
+    CONFIG,
+    CURVES,
+    DUMP,
+    METRICS,
+    PAGE,
+    REFERENCE,
+    SCORE,
+    VERSIONS,
+    read_config,
+    read_score,
+    write_json,
+)
 from tsbench.rl.stages import KINDS, settings
 from tsbench.sim.model import fingerprint
 from tsbench.viewer.run_page import write_run_page
@@ -38,6 +62,13 @@ PACKAGES = (
     "torch",
     "tsbench",
 )
+_NAMES = {  # of what has to stay the same, in words
+    "configuration": "configuration",
+    "python": "version of Python",
+    "packages": "version of a package",
+    "code": "version of tsbench's own code",
+    "physics": "model of the task",
+}
 
 
 def prepare(config: RunConfig) -> Problem:
@@ -71,25 +102,145 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
     Raises:
         TsbenchError: the configuration is wrong, the directory exists or cannot be written, or
             the method cannot do the task. A run that fails before it has trained leaves nothing.
+        Stopped: by Ctrl-C or SIGTERM.
     """
-    console = console or Console()
     problem = prepare(config)
     directory = Path(config.directory or "")
     with os_errors(directory):
         _create(directory)
-        workspace: RunWorkspace | None = None
+    with _locked(directory), _explained(directory):
         try:
             _write_provenance(directory, config, problem, words)
-            workspace = RunWorkspace(directory, console)
-            workspace.note(f"{' '.join(['tsbench run', *words])} -> {directory}")
-            return _train(config, problem, workspace, console)
+            line = f"{' '.join(['tsbench run', *words])} -> {directory}"
+            return _work(config, problem, directory, line, console or Console())
         except (TsbenchError, OSError):
-            if workspace is None or not workspace.stages:
+            if not _trained(directory):
                 shutil.rmtree(directory, ignore_errors=True)
             raise
-        finally:
-            if workspace is not None:
-                workspace.close()
+
+
+def resume(directory: Path, console: Console | None = None) -> Score:
+    """Goes on with an interrupted run, and ends with the same bits as if it had not been.
+
+    Raises:
+        TsbenchError: there is no such run, it is finished or under way, or it was begun with
+            another configuration or other versions. Beyond that, as `execute`.
+        Stopped: by Ctrl-C or SIGTERM.
+    """
+    if not (directory / CONFIG).is_file():
+        raise TsbenchError(f"there is no run in {directory}")
+    with _locked(directory), _explained(directory):
+        if (directory / SCORE).exists():
+            raise TsbenchError(f"{directory} holds a finished run: there is nothing to resume")
+        config = replace(read_config(directory), directory=str(directory))
+        problem = prepare(config)
+        _check_provenance(directory, config, problem)
+        for path in (directory / PAGE, *directory.rglob(f"*{PART}")):
+            path.unlink(missing_ok=True)
+        line = f"tsbench run resume={directory}"
+        return _work(config, problem, directory, line, console or Console())
+
+
+def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
+    """Does what is missing of a run of a sweep: all of it, the rest of it, or nothing.
+
+    Returns:
+        Its normalized reward.
+
+    Raises:
+        TsbenchError: as `execute` and `resume`; or the directory holds another run.
+        Stopped: by Ctrl-C or SIGTERM.
+    """
+    directory = Path(config.directory or "")
+    if not (directory / CONFIG).is_file():
+        return execute(config, words).normalized_reward
+    if read_config(directory).identity != config.identity:
+        raise TsbenchError(
+            f"{directory} holds a run with another configuration and nothing is overwritten"
+        )
+    if (directory / SCORE).exists():
+        Console().print(f"finished already: {directory}", highlight=False, soft_wrap=True)
+        return float(read_score(directory)["score"]["normalized_reward"])
+    return resume(directory).normalized_reward
+
+
+def _work(
+    config: RunConfig, problem: Problem, directory: Path, line: str, console: Console
+) -> Score:
+    run = json.dumps(_identity(config, problem), sort_keys=True)
+    workspace = RunWorkspace(
+        directory, console, interval=config.checkpoint, run=hashlib.sha256(run.encode()).hexdigest()
+    )
+    with closing(workspace), _signals(workspace.stop):
+        workspace.note(line)
+        score = _train(config, problem, workspace, console)
+    shutil.rmtree(directory / CHECKPOINTS, ignore_errors=True)
+    return score
+
+
+@contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """Keeps others out of the directory. The system lifts the lock whenever the process ends."""
+    with os_errors(directory):
+        descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise TsbenchError(f"another process is at work in {directory}") from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _signals(stop: Callable[[int], None]) -> Iterator[None]:
+    """Lets Ctrl-C and SIGTERM call `stop`, where that is this thread's business."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {
+        number: signal.signal(number, lambda number, _: stop(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _explained(directory: Path) -> Iterator[None]:
+    """Turns what stops a run into one line, which says how to go on where one can."""
+    try:
+        with os_errors(directory), memory_errors():
+            yield
+    except NotFiniteError as error:
+        raise TsbenchError(f"{error}{_dumped(directory, error)}") from error
+    except TsbenchError as error:
+        raise TsbenchError(f"{error}{_way_on(directory)}") from error
+    except Stopped as stopped:
+        raise Stopped(stopped.signal, f"{stopped}{_way_on(directory)}") from None
+
+
+def _dumped(directory: Path, error: NotFiniteError) -> str:
+    """Keeps what the wrong number was computed from."""
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **error.arrays)
+    with os_errors(directory / DUMP):
+        write_whole(directory / DUMP, content.getvalue())
+    return f"; what it came from is in {directory / DUMP}"
+
+
+def _way_on(directory: Path) -> str:
+    return f"; to go on: tsbench run resume={directory}" if _trained(directory) else ""
+
+
+def _trained(directory: Path) -> bool:
+    """Whether a run has anything that would be lost with its directory."""
+    metrics = directory / METRICS
+    return metrics.exists() and metrics.stat().st_size > 0
 
 
 def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console: Console) -> Score:
@@ -123,32 +274,72 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
 
 
 def _create(directory: Path) -> None:
-    try:
-        directory.mkdir(parents=True)
-    except FileExistsError:
-        if not directory.is_dir():
-            raise
-        state = "a finished run" if (directory / SCORE).exists() else "an unfinished run"
-        raise TsbenchError(
-            f"{directory} holds {state} and nothing is overwritten: choose another directory=PATH"
-        ) from None
+    """Makes the directory. One that is empty, or that a run left before it began, will do."""
+    directory.mkdir(parents=True, exist_ok=True)
+    left = {path.name for path in directory.iterdir() if path.suffix != PART}
+    if left <= {VERSIONS}:
+        return
+    if (directory / SCORE).exists():
+        state, way = "a finished run", ""
+    elif (directory / CONFIG).exists():
+        state, way = "an unfinished run", f"go on with resume={directory}, or "
+    else:
+        state, way = "other files", ""
+    raise TsbenchError(
+        f"{directory} holds {state} and nothing is overwritten: {way}choose another directory=PATH"
+    )
 
 
 def _write_provenance(
     directory: Path, config: RunConfig, problem: Problem, words: Sequence[str]
 ) -> None:
-    """Writes what is needed to repeat the run: config.yaml and versions.json."""
+    """Writes what is needed to repeat the run: versions.json, and config.yaml, which comes last:
+    its presence says that the run has begun."""
+    versions = {
+        **_identity(config, problem),
+        "platform": platform.platform(),
+        "commit": _commit(),
+    }
+    (directory / VERSIONS).unlink(missing_ok=True)
+    write_json(directory / VERSIONS, versions)
     command = " ".join(["tsbench run", *words])
     content = yaml.safe_dump(asdict(config), sort_keys=False)
-    (directory / CONFIG).write_text(f"# {command}\n{content}", encoding="utf-8")
-    versions = {
+    write_whole(directory / CONFIG, f"# {command}\n{content}".encode())
+
+
+def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
+    """All that decides what a run gives, to the last bit, on one kind of machine."""
+    code = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        code.update(path.read_bytes())
+    configuration = json.dumps(config.identity, sort_keys=True)
+    return {
+        "configuration": hashlib.sha256(configuration.encode()).hexdigest(),
         "python": platform.python_version(),
-        "platform": platform.platform(),
         "packages": {name: _version(name) for name in PACKAGES},
-        "commit": _commit(),
+        "code": code.hexdigest(),
         "physics": {problem.task.name: fingerprint(problem.task.spec())},
     }
-    write_json(directory / VERSIONS, versions)
+
+
+def _check_provenance(directory: Path, config: RunConfig, problem: Problem) -> None:
+    """
+    Raises:
+        TsbenchError: a run begun as `versions.json` says would not go on to the same bits now.
+    """
+    path = directory / VERSIONS
+    with os_errors(path):
+        content = path.read_bytes()
+    try:
+        before = dict(json.loads(content))
+    except (ValueError, TypeError) as error:
+        raise TsbenchError(f"damaged versions {path}: {error}") from None
+    for name, now in _identity(config, problem).items():
+        if before.get(name) != now:
+            raise TsbenchError(
+                f"{directory} was begun with another {_NAMES[name]} (see {path}), "
+                "so an exact resume is impossible: begin it again elsewhere"
+            )
 
 
 def _version(package: str) -> str | None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
@@ -17,9 +18,14 @@ from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-from tsbench.record import EVENTS, LOG, METRICS
+from tsbench.checkpoint import Checkpoint, Checkpoints
+from tsbench.errors import Stopped, TsbenchError
+from tsbench.problem import Monitor, Snapshot
+from tsbench.record import CHECKPOINTS, EVENTS, LOG, METRICS
 from tsbench.tables import duration, number
+from tsbench.typed import typed
 
+INTERVAL = 30.0  # seconds of training between checkpoints
 PLAIN_INTERVAL = 60.0  # seconds between lines where there is no terminal to draw a bar on
 PLAIN_SHARE = 0.1  # or this share of the stage, whichever is first
 
@@ -33,24 +39,50 @@ class Stage:
         budget: environment steps it may use.
         steps: environment steps it has used.
         physics_substeps: steps of the physics under them; none in a kinematic stage.
-        seconds: wall-clock.
+        warnings: how often mujoco warned meanwhile, by mujoco's names.
+        seconds: wall-clock of the work that is in the result. What was lost when a run was
+            interrupted, and the time until it was resumed, do not count.
+        interruptions: how often the stage was resumed.
     """
 
     name: str
     budget: int
     steps: int = 0
     physics_substeps: int = 0
+    warnings: dict[str, int] = field(default_factory=dict)
     seconds: float = 0.0
+    interruptions: int = 0
+
+
+@dataclass(frozen=True)
+class Saved:
+    """The content of a checkpoint.
+
+    Attributes:
+        run: which run it belongs to.
+        stages: the finished ones and the one under way.
+        sizes: bytes of the records that were written until then, by file.
+        learner: what the stage under way goes on from.
+    """
+
+    run: str
+    stages: list[Stage]
+    sizes: dict[str, int]
+    learner: dict[str, Any]
 
 
 @dataclass
 class RunMonitor:
-    """Takes a stage's figures, once for each iteration of its learner. A `methods.Monitor`."""
+    """Takes a stage's figures, once for each iteration of its learner. A `problem.Monitor`."""
 
     workspace: RunWorkspace
     stage: Stage
     display: _Display
-    began: float = field(default_factory=time.perf_counter)
+    saved: Snapshot | None
+    began: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.began = time.perf_counter() - self.stage.seconds
 
     @property
     def physics_substeps(self) -> int:
@@ -60,43 +92,131 @@ class RunMonitor:
     def physics_substeps(self, count: int) -> None:
         self.stage.physics_substeps = count
 
-    def update(self, steps: int, metrics: Mapping[str, float]) -> None:
-        """Records an iteration.
+    @property
+    def warnings(self) -> dict[str, int]:
+        return self.stage.warnings
+
+    @warnings.setter
+    def warnings(self, counts: dict[str, int]) -> None:
+        self.stage.warnings = counts
+
+    def update(
+        self,
+        steps: int,
+        metrics: Mapping[str, float],
+        snapshot: Callable[[], Snapshot] | None = None,
+    ) -> None:
+        """Records an iteration and, when it is time, saves what to go on from.
 
         Args:
             steps: environment steps of this stage so far.
             metrics: named scalars, such as episode_return; those that are not finite are dropped.
+            snapshot: gives all that the next iteration depends on.
+
+        Raises:
+            Stopped: a signal has arrived.
         """
         self.stage.steps = steps
         self.stage.seconds = time.perf_counter() - self.began
         finite = {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
         self.workspace.record(self.stage, finite)
         self.display.show(self.stage, finite.get("episode_return"))
+        if snapshot is not None:
+            self.workspace.keep(self.stage, snapshot)
+
+
+@dataclass
+class Finished:
+    """The monitor of a stage that was finished before the run was interrupted: all is known."""
+
+    saved: Snapshot | None
+    physics_substeps: int = 0
+    warnings: dict[str, int] = field(default_factory=dict)
+
+    def update(
+        self,
+        steps: int,
+        metrics: Mapping[str, float],
+        snapshot: Callable[[], Snapshot] | None = None,
+    ) -> None:
+        """Nothing is left to record."""
 
 
 class RunWorkspace:
-    """A run directory in use: `metrics.jsonl`, TensorBoard events and `log.txt`.
+    """A run directory in use: `metrics.jsonl`, TensorBoard events, `log.txt` and checkpoints.
 
-    A `methods.Workspace`. Everything is written at once, line by line, so that a run that is
-    killed leaves what it had.
+    A `problem.Workspace`. Everything is written at once, line by line. In a directory that an
+    interrupted run left, the records go back to the newest checkpoint: what came after it is done
+    again.
     """
 
-    def __init__(self, directory: Path, console: Console) -> None:
+    def __init__(
+        self, directory: Path, console: Console, *, interval: float = INTERVAL, run: str = ""
+    ) -> None:
+        """
+        Args:
+            directory: of the run.
+            console: where progress is shown.
+            interval: seconds of training between checkpoints.
+            run: tells this run from others: their checkpoints are refused.
+
+        Raises:
+            TsbenchError: the checkpoints are another run's, or records have been cut since.
+        """
         self.directory = directory
         self.stages: list[Stage] = []
         self._console = console
+        self._interval = interval
+        self._run = run
         self._began = time.perf_counter()
-        self._log: IO[str] = (directory / LOG).open("a", encoding="utf-8")
-        self._metrics: IO[str] = (directory / METRICS).open("a", encoding="utf-8")
-        events = directory / EVENTS
-        events.mkdir(exist_ok=True)
+        self._stopped_by: int | None = None  # a signal that has arrived
+        self._learning = False  # whether there is an iteration to finish and a state to save
+        with ExitStack() as files:
+            self._log = files.enter_context((directory / LOG).open("a", encoding="utf-8"))
+            self._checkpoints = Checkpoints(directory / CHECKPOINTS, self.note)
+            self._number, self._saved = self._newest()
+            self._records = {}
+            for name in (METRICS, EVENTS):
+                (directory / name).parent.mkdir(exist_ok=True)
+                self._records[name] = files.enter_context((directory / name).open("ab"))
+            self._rewind()
+            self._files = files.pop_all()
+
+    def _newest(self) -> tuple[int, Saved | None]:
+        """The stage to go on with, and where; -1 and nothing if the run has to begin anew."""
+        checkpoint = self._checkpoints.newest()
+        if checkpoint is None:
+            return -1, None
+        saved = _read(checkpoint)
+        if saved.run != self._run:
+            raise TsbenchError(f"{checkpoint.path} is a checkpoint of another run")
+        return checkpoint.stage, saved
+
+    def _rewind(self) -> None:
+        """Drops from the records what will be done again."""
+        lost = 0
+        for name, file in self._records.items():
+            size = self._saved.sizes[name] if self._saved else 0
+            if file.tell() < size:
+                raise TsbenchError(
+                    f"{self.directory / name} has been cut since the last checkpoint"
+                )
+            if name == METRICS:
+                lost = (self.directory / name).read_bytes()[size:].count(b"\n")
+            file.truncate(size)
+            file.seek(0, os.SEEK_END)
         # The record writer at the bottom of TensorBoard: no thread in which an error gets lost.
-        self._events = RecordWriter((events / f"events.out.tfevents.{time.time_ns()}").open("ab"))
-        self._write_event(Event(wall_time=time.time(), file_version="brain.Event:2"))
+        self._events = RecordWriter(self._records[EVENTS])
+        if not self._records[EVENTS].tell():
+            self._write_event(Event(wall_time=time.time(), file_version="brain.Event:2"))
+        if self._saved:
+            stage = self._saved.stages[-1]
+            self.note(f"resumed: {stage.name} goes on at {stage.steps:,} steps")
+        if lost:
+            self.note(f"{lost} iterations after the last checkpoint are done again")
 
     def close(self) -> None:
-        for file in (self._log, self._metrics, self._events):
-            file.close()
+        self._files.close()
 
     def note(self, line: str) -> None:
         """Tells the user something in plain words, and keeps it in the log."""
@@ -104,33 +224,80 @@ class RunWorkspace:
         self._log.write(f"{time.perf_counter() - self._began:10.1f} s  {line}\n")
         self._log.flush()
 
+    def stop(self, signal: int) -> None:
+        """Stops the run: when the iteration under way is done and saved; where there is none, or
+        when asked again, at once.
+
+        Raises:
+            Stopped: at once.
+        """
+        if self._stopped_by is not None or not self._learning:
+            raise Stopped(signal)
+        self._stopped_by = signal
+
     @contextmanager
-    def stage(self, name: str, steps: int) -> Iterator[RunMonitor]:
+    def stage(self, name: str, steps: int) -> Iterator[Monitor]:
         """A stage of the method, with its progress bar.
 
         Args:
             name: e.g. "plan", "imitate".
             steps: environment steps that it may use.
         """
+        number, learner = len(self.stages), None
         stage = Stage(name, steps)
+        if self._saved and number <= self._number:
+            stage = self._saved.stages[number]
+            checkpoint = self._checkpoints.newest(number)
+            learner = _read(checkpoint).learner if checkpoint else None
         self.stages.append(stage)
+        if stage.steps >= stage.budget:  # it was finished when the run was interrupted
+            yield Finished(learner)
+            return
+        stage.interruptions += learner is not None
+        self._saved_at = time.perf_counter()
         with _Display(self._console, stage) as display:
-            monitor = RunMonitor(self, stage, display)
+            monitor = RunMonitor(self, stage, display, learner)
             yield monitor
             stage.seconds = time.perf_counter() - monitor.began
+        self._learning = False
         self.note(f"{name}: {stage.steps:,} steps in {duration(stage.seconds)}{display.figures}")
+        for kind, count in stage.warnings.items():
+            self.note(f"{name}: mujoco warned {count:,} times of {kind}")
 
     def record(self, stage: Stage, metrics: Mapping[str, float]) -> None:
         """Appends an iteration's figures to `metrics.jsonl` and to the TensorBoard events."""
         row = {"stage": stage.name, "steps": stage.steps, "seconds": round(stage.seconds, 3)}
-        self._metrics.write(json.dumps({**row, **metrics}) + "\n")
-        self._metrics.flush()
+        self._records[METRICS].write((json.dumps({**row, **metrics}) + "\n").encode())
+        self._records[METRICS].flush()
         values = [
             Summary.Value(tag=f"{stage.name}/{name}", simple_value=value)
             for name, value in metrics.items()
         ]
         summary = Summary(value=values)
         self._write_event(Event(wall_time=time.time(), step=stage.steps, summary=summary))
+
+    def keep(self, stage: Stage, snapshot: Callable[[], Snapshot]) -> None:
+        """Saves a checkpoint if it is time: now and then, at the stage's end, before a stop.
+
+        Raises:
+            Stopped: a signal has arrived.
+        """
+        self._learning = True
+        due = time.perf_counter() - self._saved_at >= self._interval
+        if due or stage.steps >= stage.budget or self._stopped_by is not None:
+            for file in self._records.values():
+                os.fsync(file.fileno())
+            saved = Saved(
+                run=self._run,
+                stages=self.stages,
+                sizes={name: file.tell() for name, file in self._records.items()},
+                learner=dict(snapshot()),
+            )
+            number = len(self.stages) - 1
+            self._checkpoints.save(number, stage.name, stage.steps, asdict(saved))
+            self._saved_at = time.perf_counter()
+        if self._stopped_by is not None:
+            raise Stopped(self._stopped_by)
 
     def stage_rows(self) -> list[dict[str, Any]]:
         """The stages as plain values, for `score.json`."""
@@ -139,6 +306,16 @@ class RunWorkspace:
     def _write_event(self, event: Event) -> None:
         self._events.write(event.SerializeToString())
         self._events.flush()
+
+
+def _read(checkpoint: Checkpoint) -> Saved:
+    try:
+        saved: Saved = typed(Saved, checkpoint.content, "")
+        if len(saved.stages) != checkpoint.stage + 1 or saved.sizes.keys() != {METRICS, EVENTS}:
+            raise TsbenchError("it lacks stages or records")
+    except TsbenchError as error:
+        raise TsbenchError(f"damaged checkpoint {checkpoint.path}: {error}") from None
+    return saved
 
 
 class _Display:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.methods import twostage
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.policy import Policy, PolicyInfo
-from tsbench.problem import Budget, Problem
+from tsbench.problem import Budget, Problem, Snapshot
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
 
@@ -53,8 +53,14 @@ class Desk:
 class Scribe:
     steps: list[int]
     physics_substeps: int = 0
+    saved: Snapshot | None = None
 
-    def update(self, steps: int, metrics: Mapping[str, float]) -> None:
+    def update(
+        self,
+        steps: int,
+        metrics: Mapping[str, float],
+        snapshot: Callable[[], Snapshot] | None = None,
+    ) -> None:
         assert all(np.isfinite(value) for value in metrics.values())
         self.steps.append(steps)
 

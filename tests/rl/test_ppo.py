@@ -82,9 +82,9 @@ def test_steps_are_counted() -> None:
     taught.learn(129, lambda steps, metrics: reports.append((steps, dict(metrics))))
     assert [steps for steps, _ in reports] == [128, 256]
     assert taught.steps == 256
-    taught.learn(0)
+    taught.learn(256)
     assert taught.steps == 256
-    taught.learn(1, lambda steps, metrics: reports.append((steps, dict(metrics))))
+    taught.learn(257, lambda steps, metrics: reports.append((steps, dict(metrics))))
     assert reports[-1][0] == taught.steps == 384
     for _, metrics in reports:
         assert all(math.isfinite(value) for value in metrics.values())

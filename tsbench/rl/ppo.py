@@ -19,6 +19,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
+from tsbench.errors import NotFiniteError, TsbenchError
 from tsbench.mdp import Task
 from tsbench.policy import ACTIVATIONS, ENCODINGS, Policy, PolicyInfo
 from tsbench.rl.vec_env import TorchEnvironment
@@ -170,12 +171,15 @@ class Learner:
         )
 
     def learn(self, steps: int, report: Report | None = None) -> None:
-        """At least `steps` environment steps, in whole iterations."""
+        """Goes on until `steps` environment steps have been taken in all, in whole iterations.
+
+        Raises:
+            NotFiniteError: a number in state, reward, action or loss is not finite.
+        """
         ppo, env = self._ppo, self._env
         ppo.train_mode()
         observation = env.get_observations()
-        end = self.steps + steps
-        while self.steps < end:
+        while self.steps < steps:
             started = time.perf_counter()
             before = (self.environment.seconds, self.environment.dynamics.seconds)
             with torch.inference_mode():
@@ -189,8 +193,9 @@ class Learner:
                 ppo.compute_returns(observation)
             collected = time.perf_counter()
             losses = ppo.update()
+            self._expect_finite(losses)
             self.steps += env.num_envs * self.settings.rollout
-            self._bound_std(min(self.steps / end, 1.0))
+            self._bound_std(min(self.steps / steps, 1.0))
             if report is not None:
                 metrics = {
                     "collect_seconds": collected - started,
@@ -205,6 +210,16 @@ class Learner:
                     metrics["episode_return"] = float(np.mean(self._returns))
                     metrics["episode_length"] = float(np.mean(self._lengths))
                 report(self.steps, metrics)
+
+    def _expect_finite(self, losses: Mapping[str, float]) -> None:
+        for name, loss in losses.items():
+            if not math.isfinite(loss):
+                storage = self._ppo.storage
+                names = ("actions", "rewards", "dones", "values", "returns", "advantages")
+                arrays = {name: getattr(storage, name).numpy() for name in names}
+                arrays |= _arrays(storage.observations.to_dict())
+                message = f"the {name} loss is not finite in the iteration after {self.steps} steps"
+                raise NotFiniteError(message, arrays)
 
     def _bound_std(self, share: float) -> None:
         """Holds the policy's spread below its bound after a share of the stage."""
@@ -221,6 +236,56 @@ class Learner:
         self._lengths.extend(self._length[ended].tolist())
         self._return[ended] = 0.0
         self._length[ended] = 0
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that the next iteration depends on: plain values, and arrays that it will change."""
+        ppo = self._ppo
+        return {
+            "steps": self.steps,
+            "actor": _arrays(ppo.actor.state_dict()),
+            "critic": _arrays(ppo.critic.state_dict()),
+            "optimizer": {
+                str(index): _arrays(moments)
+                for index, moments in ppo.optimizer.state_dict()["state"].items()
+            },
+            "learning_rate": ppo.learning_rate,
+            "rng": torch.get_rng_state().numpy(),
+            "environment": self._env.snapshot(),
+            "episodes": {
+                "returns": list(self._returns),
+                "lengths": list(self._lengths),
+                "return": self._return,
+                "length": self._length,
+            },
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from where `snapshot` was taken, to the last bit.
+
+        Raises:
+            TsbenchError: it was taken from another kind of learner.
+        """
+        ppo = self._ppo
+        try:
+            self.steps = snapshot["steps"]
+            ppo.actor.load_state_dict(_tensors(snapshot["actor"]))
+            ppo.critic.load_state_dict(_tensors(snapshot["critic"]))
+            groups = ppo.optimizer.state_dict()["param_groups"]
+            for group in groups:
+                group["lr"] = snapshot["learning_rate"]
+            moments = {int(i): _tensors(state) for i, state in snapshot["optimizer"].items()}
+            ppo.optimizer.load_state_dict({"state": moments, "param_groups": groups})
+            ppo.learning_rate = snapshot["learning_rate"]
+            torch.set_rng_state(torch.from_numpy(snapshot["rng"]))
+            self._env.restore(snapshot["environment"])
+            episodes = snapshot["episodes"]
+            self._returns.extend(episodes["returns"])
+            self._lengths.extend(episodes["lengths"])
+            self._return[:] = episodes["return"]
+            self._length[:] = episodes["length"]
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            reason = " ".join(str(error).split())
+            raise TsbenchError(f"the checkpoint does not fit this stage: {reason}") from None
 
     def policy(self, task: Task[Any], method: str) -> Policy:
         """What has been learned for the task, as an artefact."""
@@ -243,3 +308,11 @@ class Learner:
             weights=weights,
             biases=tuple(layer.bias.detach().numpy().copy() for layer in linear),
         )
+
+
+def _arrays(tensors: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:
+    return {name: tensor.numpy() for name, tensor in tensors.items()}
+
+
+def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}

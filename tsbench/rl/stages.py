@@ -7,8 +7,8 @@ from typing import Any
 
 from tsbench.errors import TsbenchError, unknown
 from tsbench.mdp import Task
-from tsbench.problem import Problem, Workspace
-from tsbench.rl.ppo import Learner, PPOSettings
+from tsbench.problem import Monitor, Problem, Workspace
+from tsbench.rl.ppo import Learner, PPOSettings, Report
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.kinematic import Planning
 from tsbench.typed import typed_items
@@ -50,9 +50,10 @@ def learn_planning(
     environment = BatchedEnvironment(planning, planning, chosen.environments, problem.seed)
     with workspace.stage("plan", steps) as monitor:
         learner = Learner(environment, chosen, problem.seed)
-        learner.learn(steps // 2, monitor.update)
+        report = _reporting(learner, monitor)
+        learner.learn(steps // 2, report)
         planning.explore = 0.0
-        learner.learn(steps - learner.steps, monitor.update)
+        learner.learn(steps, report)
     return learner
 
 
@@ -70,11 +71,20 @@ def learn_physics(
     physics: Physics[Any] = Physics(task, chosen.environments, threads=problem.threads)
     environment = BatchedEnvironment(task, physics, chosen.environments, problem.seed)
     with workspace.stage(name, steps) as monitor:
-
-        def report(done: int, metrics: Mapping[str, float]) -> None:
-            monitor.physics_substeps = physics.substeps
-            monitor.update(done, metrics)
-
         learner = Learner(environment, chosen, problem.seed, start_from)
-        learner.learn(steps, report)
+        learner.learn(steps, _reporting(learner, monitor, physics))
     return learner
+
+
+def _reporting(learner: Learner, monitor: Monitor, physics: Physics[Any] | None = None) -> Report:
+    """Reports a learner's iterations, once it stands where an interrupted run left it."""
+    if monitor.saved is not None:
+        learner.restore(monitor.saved)
+
+    def report(steps: int, metrics: Mapping[str, float]) -> None:
+        if physics is not None:
+            monitor.physics_substeps = physics.substeps
+            monitor.warnings = physics.warned()
+        monitor.update(steps, metrics, learner.snapshot)
+
+    return report

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,17 @@ class TorchEnvironment(VecEnv):
         dones = torch.from_numpy(transition.terminal) | time_outs
         rewards = torch.from_numpy(transition.reward).float()
         return self._observation, rewards, dones.long(), {"time_outs": time_outs.float()}
+
+    def snapshot(self) -> dict[str, Any]:
+        """The environment's, with the observation that the next action answers."""
+        observation = {name: tensor.numpy() for name, tensor in self._observation.items()}
+        return {"observation": observation, "environment": self.environment.snapshot()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from where `snapshot` was taken."""
+        self.environment.restore(snapshot["environment"])
+        for name, value in snapshot["observation"].items():
+            self._observation[name].copy_(torch.from_numpy(value))
 
     def _tensors(self, observation: np.ndarray) -> TensorDict:
         environment = self.environment

@@ -9,27 +9,42 @@ Laikago, two cores (`tsbench bench`).
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Generic, Protocol
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
+from mujoco.batch import Batch, SimulationError
 
-from tsbench.mdp import MDP, Array, Readings, Rng, S, Start, Task
-from tsbench.sim.model import sensor_slices
+from tsbench.errors import NotFiniteError, TsbenchError
+from tsbench.mdp import MDP, Array, Readings, Rng, S, Start, State, Task
+from tsbench.sim.model import UNSTABLE, sensor_slices
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
+_NUMBER = 1  # of a kind of warning, beside what it was about, in `Batch.warning`
+
+
+def _counted(message: str) -> None:
+    """mujoco's warnings are counted here; else each would go to the error stream, and to a file
+    in the current directory."""
+
+
+mujoco.set_mju_user_warning(_counted)
 
 
 class Dynamics(Protocol[S]):
     """What turns actions into states, for a fixed number of episodes.
 
     Attributes:
+        diverged: rows in which the last step could not be computed, sorted. They keep the state
+            they had before it, and their episodes have to end.
         seconds: spent in a physics engine so far, wall-clock.
     """
 
+    diverged: np.ndarray
     seconds: float
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
@@ -39,13 +54,26 @@ class Dynamics(Protocol[S]):
         """The states of all episodes one time step later."""
 
 
+class LastingDynamics(Dynamics[S], Protocol[S]):
+    """Dynamics that can be saved and go on later."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that it remembers between two calls: plain values and arrays."""
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from where `snapshot` was taken."""
+
+
 class Physics(Generic[S]):
     """A task's full physics.
 
     Attributes:
         batch: the simulations; a write to `batch.xfrc_applied` pushes them.
         substeps: physics steps done so far, all episodes together.
-        seconds: spent in MuJoCo so far, wall-clock.
+        warnings: how often mujoco has warned, of each kind (mjtWarning), all episodes together.
+        diverged: rows in which mujoco met a number that is not finite, or huge, in the last step.
+            mujoco itself resets such a simulation and goes on in its midst.
+        seconds: spent in mujoco so far, wall-clock.
     """
 
     def __init__(
@@ -56,6 +84,8 @@ class Physics(Generic[S]):
         self.perturbed = perturbed
         self.substeps = 0
         self.seconds = 0.0
+        self.warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), int)
+        self.diverged = np.zeros(0, int)
         spec = task.spec()
         spec.compiler.discardvisual = True  # 10 % faster, the same states to the last bit
         model = spec.compile()
@@ -78,18 +108,47 @@ class Physics(Generic[S]):
         self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self._qpos[rows] = start.qpos
         self._qvel[rows] = start.qvel
-        self.batch.forward(ids, stage=_CURRENT)
+        with _one_line():
+            self.batch.forward(ids, stage=_CURRENT)
         self.seconds += perf_counter() - began
         return self._read(rows, start.time, start.memory)
 
     def advance(self, state: S, action: Array) -> S:
         control, memory = self.task.control(state, action)
         self._ctrl[:] = control
+        self.batch.warning[:] = 0
         began = perf_counter()
-        self.batch.step(nstep=self.task.substeps, stage=_CURRENT)
+        with _one_line():
+            self.batch.step(nstep=self.task.substeps, stage=_CURRENT)
         self.seconds += perf_counter() - began
         self.substeps += len(control) * self.task.substeps
-        return self._read(slice(None), state.time + self.task.timestep, memory)
+        following = self._read(slice(None), state.time + self.task.timestep, memory)
+        warned = self.batch.warning[:, :, _NUMBER]
+        self.warnings += warned.sum(axis=0)
+        self.diverged = np.flatnonzero(warned[:, UNSTABLE].any(axis=1))
+        if len(self.diverged):
+            following = following.updated(self.diverged, state.rows(self.diverged))
+        return following
+
+    def warned(self) -> dict[str, int]:
+        """How often mujoco has warned, by mujoco's names; without those that never came."""
+        return {
+            mujoco.mjtWarning(kind).name: int(self.warnings[kind])
+            for kind in np.flatnonzero(self.warnings)
+        }
+
+    def snapshot(self) -> dict[str, Any]:
+        # The rows of mjSTATE_INTEGRATION, from which mujoco continues to the last bit.
+        return {
+            "simulations": self.batch.state,
+            "substeps": self.substeps,
+            "warnings": self.warnings,
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        self.batch.state[:] = snapshot["simulations"]
+        self.substeps = snapshot["substeps"]
+        self.warnings = snapshot["warnings"]
 
     def _read(self, rows: Any, time: np.ndarray, memory: np.ndarray) -> S:
         # Copies: the batch's arrays change under whoever holds them.
@@ -105,6 +164,16 @@ class Physics(Generic[S]):
         )
 
 
+@contextmanager
+def _one_line() -> Iterator[None]:
+    """Tells in one line what mujoco refuses to compute."""
+    try:
+        yield
+    except SimulationError as error:
+        reason = " ".join(str(error).split())
+        raise TsbenchError(f"the physics cannot go on: {reason}") from None
+
+
 @dataclass(frozen=True)
 class Transition(Generic[S]):
     """What a step gave; shapes (n,) unless said otherwise.
@@ -113,7 +182,8 @@ class Transition(Generic[S]):
         observation: of the state that follows, shape (n, observation_size); where an episode
             ended, of the next one's start.
         reward: of the step.
-        terminal: the episode ended for a reason other than its last step.
+        terminal: the episode ended for a reason other than its last step. Its physics having
+            diverged is one; the reward of that step is zero.
         truncated: the episode ended with its last step.
         ended: the rows of either kind of ending, shape (k,).
         final: the states that those episodes ended in, k of them.
@@ -137,7 +207,7 @@ class BatchedEnvironment(Generic[S]):
         seconds: spent in `step` so far, wall-clock.
     """
 
-    def __init__(self, mdp: MDP[S], dynamics: Dynamics[S], count: int, seed: int) -> None:
+    def __init__(self, mdp: MDP[S], dynamics: LastingDynamics[S], count: int, seed: int) -> None:
         self.mdp = mdp
         self.dynamics = dynamics
         self.count = count
@@ -154,13 +224,22 @@ class BatchedEnvironment(Generic[S]):
         return observation
 
     def step(self, action: np.ndarray) -> Transition[S]:
-        """One time step of all episodes; `action` has shape (n, action_size)."""
+        """One time step of all episodes; `action` has shape (n, action_size).
+
+        Raises:
+            NotFiniteError: a number in action, state or reward is not finite.
+        """
         began = perf_counter()
         previous = self.state
-        state = self.dynamics.advance(previous, action)
         self.steps += 1
+        expect_finite(self.steps, previous, action)
+        state = self.dynamics.advance(previous, action)
         reward = self.mdp.reward(previous, action, state)
+        expect_finite(self.steps, previous, action, state, reward)
         terminal = self.mdp.terminal(state)
+        diverged = self.dynamics.diverged
+        if len(diverged):
+            reward[diverged], terminal[diverged] = 0.0, True
         truncated = (self.steps >= self.mdp.horizon) & ~terminal
         ended = np.flatnonzero(terminal | truncated)
         final = state.rows(ended)
@@ -172,3 +251,53 @@ class BatchedEnvironment(Generic[S]):
         observation = self.mdp.observation(state)
         self.seconds += perf_counter() - began
         return Transition(observation, reward, terminal, truncated, ended, final)
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that the next step depends on, but for the action: plain values and arrays."""
+        return {
+            "rng": self.rng.bit_generator.state,
+            "steps": self.steps,
+            "state": vars(self.state),
+            "dynamics": self.dynamics.snapshot(),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from where `snapshot` was taken; `reset` must have been called before."""
+        self.rng.bit_generator.state = snapshot["rng"]
+        self.steps = snapshot["steps"]
+        self.state = self.state.replace(**snapshot["state"])
+        self.dynamics.restore(snapshot["dynamics"])
+
+
+def expect_finite(
+    steps: np.ndarray,
+    previous: State,
+    action: np.ndarray,
+    state: State | None = None,
+    reward: np.ndarray | None = None,
+) -> None:
+    """Looks at a step of many episodes.
+
+    Args:
+        steps: of each episode so far, shape (n,).
+        previous: the state before the step.
+        action: shape (n, action_size).
+        state: the state after it, once it is known.
+        reward: of the step, shape (n,), once it is known.
+
+    Raises:
+        NotFiniteError: a number is not finite. It names the episode, its step and the quantity.
+    """
+    looked_at: dict[str, np.ndarray] = {"action": action}
+    if state is not None and reward is not None:
+        looked_at = {**vars(state), "reward": reward}
+    for name, values in looked_at.items():
+        if np.isfinite(values).all():
+            continue
+        finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        row = int(np.flatnonzero(~finite)[0])
+        before = {f"previous_{key}": value for key, value in vars(previous).items()}
+        raise NotFiniteError(
+            f"{name} of environment {row} is not finite at step {steps[row]} of its episode",
+            {"steps": steps, **before, "action": action, **looked_at},
+        )

@@ -9,7 +9,7 @@ from typing import Any, Generic
 import numpy as np
 
 from tsbench.mdp import MDP, S
-from tsbench.sim.batched import Dynamics
+from tsbench.sim.batched import Dynamics, expect_finite
 
 PolicyFunction = Callable[[np.ndarray], np.ndarray]  # observations (n, o) -> actions (n, a)
 
@@ -22,7 +22,9 @@ class Episodes(Generic[S]):
         rewards: shape (T, n); zero once an episode has ended.
         lengths: steps taken, shape (n,).
         reached: whether the episode ended at its goal, unspoiled, shape (n,).
-        violated: whether something spoiled it on the way, shape (n,).
+        violated: whether something spoiled it on the way, shape (n,). Its physics having diverged,
+            which ends it with a reward of zero for that step, does.
+        diverged: whether that happened, shape (n,).
         final: the last state of each episode.
         states: what `record` made of every state, start included, shape (T + 1, n, ...), each
             episode's last one repeated after its end; None without `record`.
@@ -34,6 +36,7 @@ class Episodes(Generic[S]):
     lengths: np.ndarray
     reached: np.ndarray
     violated: np.ndarray
+    diverged: np.ndarray
     final: S
     states: np.ndarray | None
     actions: np.ndarray
@@ -62,12 +65,16 @@ def play(
     record: Callable[[S], np.ndarray] | None = None,
     disturb: Callable[[int], None] | None = None,
 ) -> Episodes[S]:
-    """Plays `count` episodes. `disturb` is called with the step's number before each step."""
+    """Plays `count` episodes. `disturb` is called with the step's number before each step.
+
+    Raises:
+        NotFiniteError: a number in action, state or reward is not finite.
+    """
     rng = np.random.default_rng(seed)
     state: Any = dynamics.begin(rng, np.arange(count))
     final = state
     alive = np.ones(count, bool)
-    reached, violated = np.zeros(count, bool), np.zeros(count, bool)
+    reached, violated, diverged = (np.zeros(count, bool) for _ in range(3))
     lengths = np.zeros(count, int)
     rewards = np.zeros((mdp.horizon, count))
     actions = np.zeros((mdp.horizon, count, mdp.action_size))
@@ -78,13 +85,18 @@ def play(
         action = policy(mdp.observation(state))
         following = dynamics.advance(state, action)
         reward = mdp.reward(state, action, following)
+        failed = np.zeros(count, bool)
+        failed[dynamics.diverged] = True
+        reward[failed] = 0.0
+        expect_finite(lengths + 1, state, action, following, reward)
         rewards[step, alive] = reward[alive]
         actions[step, alive] = action[alive]
         lengths[alive] += 1
-        violated |= alive & mdp.violated(following)
+        diverged |= alive & failed
+        violated |= alive & (mdp.violated(following) | failed)
         rows = np.flatnonzero(alive)
         final = final.updated(rows, following.rows(rows))
-        ended = alive & mdp.terminal(following)
+        ended = alive & (mdp.terminal(following) | failed)
         reached |= ended & mdp.reached(following) & ~violated
         alive &= ~ended
         state = following
@@ -100,6 +112,7 @@ def play(
         lengths=lengths,
         reached=reached,
         violated=violated,
+        diverged=diverged,
         final=final,
         states=np.stack(recorded) if record else None,
         actions=actions,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,8 @@ class Planning(MDP[S]):
 
     # Its dynamics, for BatchedEnvironment
 
+    diverged = np.zeros(0, int)  # there is no physics that could
+
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         start = self.abstraction.start(len(rows))
         if not self.explore:
@@ -67,6 +70,12 @@ class Planning(MDP[S]):
 
     def advance(self, state: S, action: Array) -> S:
         return self.abstraction.advance(state, action)
+
+    def snapshot(self) -> dict[str, Any]:
+        return {"explore": self.explore}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        self.explore = snapshot["explore"]
 
 
 def plan_by_hand(planning: Planning[Any]) -> Plan:

@@ -17,6 +17,16 @@ _FOLDERS = (
     Path(__file__).parents[2] / "models",
 )
 
+# Kinds of warnings after which mujoco resets a simulation in its midst.
+UNSTABLE = [
+    int(kind)
+    for kind in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+]
+
 
 def model_path(name: str) -> Path:
     """The hand-written MJCF of that name.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import dm_env.specs
@@ -13,8 +15,9 @@ from dm_control.mujoco.wrapper import MjModel
 from dm_control.rl import control
 
 from tsbench.mdp import MDP, Array, Readings, State, Task
+from tsbench.sim.batched import expect_finite
 from tsbench.sim.kinematic import Planning
-from tsbench.sim.model import sensor_slices
+from tsbench.sim.model import UNSTABLE, sensor_slices
 
 ROW = np.array([0])  # the batch of one that every state here is
 
@@ -47,6 +50,7 @@ class Adapter(control.Task):
         self._previous = self.state
         self._action = np.asarray(action, float)[None]
         self._steps += 1
+        expect_finite(np.array([self._steps]), self._previous, self._action)
 
     def get_observation(self, physics: dm_mujoco.Physics) -> OrderedDict[str, np.ndarray]:
         return OrderedDict({control.FLAT_OBSERVATION_KEY: self.mdp.observation(self.state)[0]})
@@ -92,7 +96,14 @@ class PhysicsAdapter(Adapter):
         physics.set_control(ctrl[0])
 
     def after_step(self, physics: dm_mujoco.Physics) -> None:
-        self._read(physics, self.state.time + self.task.timestep, self._memory)
+        if not physics.diverged:
+            self._read(physics, self.state.time + self.task.timestep, self._memory)
+
+    def get_reward(self, physics: dm_mujoco.Physics) -> float:
+        return 0.0 if physics.diverged else super().get_reward(physics)
+
+    def get_termination(self, physics: dm_mujoco.Physics) -> float | None:
+        return 0.0 if physics.diverged else super().get_termination(physics)
 
     def _read(self, physics: dm_mujoco.Physics, time: np.ndarray, memory: np.ndarray) -> None:
         data = physics.data
@@ -134,11 +145,28 @@ class PlanningAdapter(Adapter):
 
 
 class ExactPhysics(dm_mujoco.Physics):
-    """dm_control's physics, but for what follows a reset: dm_control computes the first state
-    with actuators disabled, which leaves zero velocities for their damping in the first step."""
+    """dm_control's physics, but for two things.
+
+    What follows a reset: dm_control computes the first state with actuators disabled, which leaves
+    zero velocities for their damping in the first step. And what follows a step that could not be
+    computed: dm_control raises an error; here the episode ends, as it does among many.
+
+    Attributes:
+        diverged: whether the last step could not be computed.
+    """
+
+    diverged = False
 
     def after_reset(self) -> None:
         self.forward()
+
+    @contextmanager
+    def check_invalid_state(self) -> Iterator[None]:
+        """What dm_control wraps every computation in."""
+        warnings = self.data.ptr.warning.number
+        warnings[:] = 0
+        yield
+        self.diverged = bool(warnings[UNSTABLE].any())
 
 
 class StillPhysics(dm_mujoco.Physics):

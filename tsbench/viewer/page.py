@@ -8,7 +8,6 @@ small player (page.html) with captions. Nothing here starts a process or opens a
 from __future__ import annotations
 
 import base64
-import contextlib
 import html
 import importlib.resources
 import json
@@ -28,6 +27,7 @@ from meshcat import Visualizer
 from numpy.typing import ArrayLike, NDArray
 
 from tsbench.errors import TsbenchError
+from tsbench.files import write_whole
 from tsbench.viewer import scene
 from tsbench.viewer.scene import Array, Colour
 
@@ -519,11 +519,7 @@ def write_page(
         step = timestep if ghost_timestep is None else ghost_timestep
         actors.append(Actor("plan", ghost, step, PLAN_COLOUR, PLAN_NOTE, ghost=True))
     text = render(model, actors, title, summary)
-    temporary = path.with_name(path.name + ".part")  # so that no half-written page is left
     try:
-        temporary.write_text(text, "utf-8")
-        temporary.replace(path)
+        write_whole(path, text.encode())
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise TsbenchError(f"cannot write {path}: {error.strerror or error}") from error
