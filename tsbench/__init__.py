@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from tsbench.motion import ReferenceMotion
     from tsbench.sim.batched import BatchedEnvironment
+    from tsbench.sim.push import Push
 
 choose_backend()
 
@@ -54,6 +55,7 @@ def load(
     reference: ReferenceMotion | None = None,
     seed: int | None = None,
     perturbed: bool = False,
+    push: Push | None = None,
     **constants: Any,
 ) -> Environment:
     """One dm_control environment of a task.
@@ -65,6 +67,7 @@ def load(
         reference: what the imitation variant imitates.
         seed: of the random starts, None for fresh entropy.
         perturbed: whether episodes begin near the task's start instead of at it.
+        push: what disturbs every episode.
         constants: changes to what defines the task, for studies.
 
     Raises:
@@ -72,8 +75,8 @@ def load(
     """
     from tsbench.sim.single import environment
 
-    mdp = _variant(name, variant, reference, perturbed, constants)
-    return environment(mdp, seed, perturbed=perturbed)
+    mdp = _variant(name, variant, reference, perturbed, push, constants)
+    return environment(mdp, seed, perturbed=perturbed, push=push)
 
 
 def load_batched(
@@ -84,20 +87,21 @@ def load_batched(
     reference: ReferenceMotion | None = None,
     seed: int = 0,
     perturbed: bool = False,
+    push: Push | None = None,
     threads: int | None = None,
     **constants: Any,
 ) -> BatchedEnvironment[Any]:
     """`count` environments of a task stepped together; arguments otherwise as in `load`.
 
-    `threads` None means all cores.
+    `threads` None means all cores; `push` may be another one for each environment.
     """
     from tsbench.sim.batched import BatchedEnvironment, Physics
     from tsbench.sim.kinematic import Planning
 
-    mdp = _variant(name, variant, reference, perturbed, constants)
+    mdp = _variant(name, variant, reference, perturbed, push, constants)
     dynamics: Any = mdp
     if not isinstance(mdp, Planning):
-        dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed)
+        dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed, push=push)
     return BatchedEnvironment(mdp, dynamics, count, seed)
 
 
@@ -106,6 +110,7 @@ def _variant(
     variant: str | None,
     reference: ReferenceMotion | None,
     perturbed: bool,
+    push: Push | None,
     constants: dict[str, Any],
 ) -> Any:
     from tsbench import tasks
@@ -118,6 +123,8 @@ def _variant(
     if variant == "planning":
         if perturbed:
             raise TsbenchError("the planning variant has no perturbed starts")
+        if push is not None:
+            raise TsbenchError("the planning variant has no body to push")
         return Planning(task)
     if variant == "imitation":
         if reference is None:

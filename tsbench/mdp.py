@@ -191,6 +191,7 @@ class Task(MDP[S]):
     """An MDP in full physics, with a sparse reward."""
 
     substeps: int  # physics steps in one control step
+    pushed: str  # the body that pushes act on, at its centre of mass
     imitation_forms: tuple[str, ...]  # tracking rewards on offer, the default first
 
     @abstractmethod

@@ -21,6 +21,7 @@ from mujoco.batch import Batch, SimulationError
 from tsbench.errors import NotFiniteError, TsbenchError
 from tsbench.mdp import MDP, Array, Readings, Rng, S, Start, State, Task
 from tsbench.sim.model import UNSTABLE, sensor_slices
+from tsbench.sim.push import Push
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 _NUMBER = 1  # of a kind of warning, beside what it was about, in `Batch.warning`
@@ -65,7 +66,8 @@ class Physics(Generic[S]):
     """A task's full physics.
 
     Attributes:
-        batch: the simulations; a write to `batch.xfrc_applied` pushes them.
+        batch: the simulations.
+        push: what disturbs the episodes, or None.
         substeps: physics steps done so far, all episodes together.
         warnings: how often mujoco has warned, of each kind (mjtWarning), all episodes together.
         diverged: rows in which mujoco met a number that is not finite, or huge, in the last step.
@@ -73,11 +75,18 @@ class Physics(Generic[S]):
     """
 
     def __init__(
-        self, task: Task[S], count: int, *, threads: int | None = None, perturbed: bool = False
+        self,
+        task: Task[S],
+        count: int,
+        *,
+        threads: int | None = None,
+        perturbed: bool = False,
+        push: Push | None = None,
     ) -> None:
         """`threads` None means all cores; `perturbed` picks the task's perturbed starts."""
         self.task = task
         self.perturbed = perturbed
+        self.push = push
         self.substeps = 0
         self.warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), int)
         self.diverged = np.zeros(0, int)
@@ -90,6 +99,7 @@ class Physics(Generic[S]):
         self._qvel = self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
         self._sensordata = self.batch.bind("sensordata")
+        self._force = self.batch.bind("xfrc_applied")[:, model.body(task.pushed).id, :3]
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         return self.place(rows, self.task.start(rng, len(rows), perturbed=self.perturbed))
@@ -107,6 +117,9 @@ class Physics(Generic[S]):
     def advance(self, state: S, action: Array) -> S:
         control, memory = self.task.control(state, action)
         self._ctrl[:] = control
+        self._force[:] = 0.0
+        if self.push is not None:
+            self._force[:] = self.push.during(state.time, self.task.timestep)
         self.batch.warning[:] = 0
         with _one_line():
             self.batch.step(nstep=self.task.substeps, stage=_CURRENT)

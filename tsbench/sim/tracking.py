@@ -35,6 +35,7 @@ class Imitation(Task[S]):
         self.horizon = self.tracking.horizon
         self.timestep = task.timestep
         self.substeps = task.substeps
+        self.pushed = task.pushed
         self.imitation_forms = task.imitation_forms
         self.observation_size = task.observation_size
         self.action_size = task.action_size

@@ -140,6 +140,7 @@ class Laikago(Task[LaikagoState]):
     action_size: int = 12
     max_reward: float = 1.0
     imitation_forms: tuple[str, ...] = ("deepmimic",)
+    pushed = "trunk"
 
     # The MDP
 

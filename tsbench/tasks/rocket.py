@@ -88,6 +88,7 @@ class Rocket(Task[RocketState]):
     action_size: int = 2
     max_reward: float = GOAL_WEIGHT
     imitation_forms: tuple[str, ...] = ("progress", "paper")
+    pushed = "rocket"
 
     @property
     def goal(self) -> np.ndarray:
