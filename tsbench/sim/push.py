@@ -10,7 +10,7 @@ import numpy as np
 @dataclass(frozen=True)
 class Push:
     """A constant force for a while on the body that a task lets be pushed (`Task.pushed`), at its
-    centre of mass. One for all episodes, or, with a leading axis n, one for each of n.
+    centre of mass. One for all episodes, or, with a leading axis n everywhere, one for each.
 
     Attributes:
         time: when it begins, in seconds since the start of the episode, shape () or (n,).
@@ -21,6 +21,12 @@ class Push:
     time: np.ndarray | float
     duration: np.ndarray | float
     force: np.ndarray
+
+    def rows(self, rows: np.ndarray | slice) -> Push:
+        """The pushes of some members of the batch; a push for all is theirs too."""
+        if np.ndim(self.force) == 1:
+            return self
+        return Push(np.asarray(self.time)[rows], np.asarray(self.duration)[rows], self.force[rows])
 
     def during(self, time: np.ndarray, timestep: float) -> np.ndarray:
         """The force in newtons over the control steps that begin at `time` (n,), shape (n, 3).

@@ -16,6 +16,7 @@ from dm_control.rl import control
 
 from tsbench.mdp import MDP, Array, Readings, State, Task
 from tsbench.sim.batched import expect_finite
+from tsbench.sim.change import Change
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
@@ -204,15 +205,19 @@ def environment(
     *,
     perturbed: bool = False,
     push: Push | None = None,
+    change: Change | None = None,
 ) -> control.Environment:
     """One environment of a task or of its planning or imitation variant; in full physics, with a
-    push in every episode if one is given."""
+    push in every episode and with other physics if they are given."""
     rng = np.random.default_rng(seed)
     if isinstance(mdp, Planning):
         physics = StillPhysics.from_model(MjModel(mdp.task.spec().compile()))
         physics.plan_timestep = mdp.timestep
         return control.Environment(physics, PlanningAdapter(mdp, rng), n_sub_steps=1)
-    physics = ExactPhysics.from_model(MjModel(mdp.spec().compile()))
+    model = mdp.spec().compile()
+    if change is not None:
+        change.apply(model)
+    physics = ExactPhysics.from_model(MjModel(model))
     return control.Environment(
         physics, PhysicsAdapter(mdp, rng, perturbed, push), n_sub_steps=mdp.substeps
     )
