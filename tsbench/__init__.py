@@ -15,9 +15,15 @@ from tsbench.errors import TsbenchError, unknown
 from tsbench.gl import choose_backend
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import numpy as np
     from dm_control.rl.control import Environment
 
+    from tsbench.evaluation.evaluate import Score
     from tsbench.motion import ReferenceMotion
+    from tsbench.policy import Policy
     from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.push import Push
 
@@ -28,7 +34,7 @@ try:
 except PackageNotFoundError:  # a checkout on the path that was never installed
     __version__ = "0+unknown"
 
-__all__ = ["TsbenchError", "list_methods", "list_tasks", "load", "load_batched"]
+__all__ = ["TsbenchError", "evaluate", "list_methods", "list_tasks", "load", "load_batched"]
 
 Variant = Literal["planning", "imitation"]
 VARIANTS: tuple[Variant, ...] = ("planning", "imitation")
@@ -103,6 +109,43 @@ def load_batched(
     if not isinstance(mdp, Planning):
         dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed, push=push)
     return BatchedEnvironment(mdp, dynamics, count, seed)
+
+
+def evaluate(
+    policy: Policy | Path | str | Callable[[np.ndarray], Any],
+    task: str,
+    *,
+    protocol: str = "v1",
+    threads: int | None = None,
+) -> Score:
+    """Scores a policy by the evaluation protocol (`tsbench/evaluation/protocol.py`).
+
+    Args:
+        policy: a `tsbench.policy.Policy`, the directory of one, an ONNX file, or any function of
+            one observation (o,) that returns one action (a,) in [-1, 1]. For stable-baselines3
+            there is `tsbench.adapters.from_sb3`.
+        task: its name.
+        protocol: "v1", or "smoke" for a first look that cannot be ranked.
+        threads: for the physics, None for all cores; the score does not depend on it.
+
+    Raises:
+        TsbenchError: an unknown name, a policy for another task, or one that does not fit.
+    """
+    from pathlib import Path
+
+    from tsbench import adapters, tasks
+    from tsbench.evaluation import protocol as protocols
+    from tsbench.evaluation.evaluate import evaluate as score
+    from tsbench.policy import Policy
+
+    made = tasks.make(task)
+    if protocol not in protocols.PROTOCOLS:
+        raise unknown("protocol", protocol, protocols.PROTOCOLS)
+    if isinstance(policy, (str, Path)):
+        policy = adapters.load(Path(policy), made)
+    if not isinstance(policy, (Policy, adapters.ForeignPolicy)):
+        policy = adapters.from_function(policy, made)
+    return score(policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads)
 
 
 def _variant(
