@@ -52,6 +52,7 @@ def finished(shown: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_directory_holds_everything(shown: tuple[Path, str]) -> None:
     assert {path.name for path in shown[0].iterdir()} == {
+        "actions.npz",
         "config.yaml",
         "learning_curves.png",
         "log.txt",
@@ -125,7 +126,8 @@ def test_the_table_tells_the_score_the_cost_and_where_to_look(shown: tuple[Path,
         "normalized_reward",
         "optimality",
         "success",
-        "100 perturbed starts",
+        "10 perturbed starts",
+        "survival_100N",
         f"tsbench evaluate {directory}",
         f"{directory / 'view.html'}",
     ):
@@ -157,7 +159,7 @@ def test_a_used_directory_is_refused_and_stays(finished: Path) -> None:
 
 def test_evaluate_repeats_the_score(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["evaluate", "one", "--json", "again.json"]) == 0
-    assert "equal to one/score.json" in capsys.readouterr().out
+    assert "one/score.json: compared bit for bit: equal" in capsys.readouterr().out
     assert json.loads(Path("again.json").read_text()) == record.read_score(finished)["score"]
 
 
@@ -167,7 +169,8 @@ def test_evaluate_needs_the_policy_file_alone(
     Path("bare").mkdir()
     for name in ("policy.json", "policy.safetensors"):
         shutil.copy(finished / name, "bare")
-    assert cli.main(["evaluate", "bare", "--json", "bare.json"]) == 0
+    words = ["evaluate", "bare", "--protocol", "smoke", "--threads", "1", "--json", "bare.json"]
+    assert cli.main(words) == 0
     assert "score.json" not in capsys.readouterr().out
     assert json.loads(Path("bare.json").read_text()) == record.read_score(finished)["score"]
 
@@ -179,15 +182,41 @@ def test_evaluate_says_when_a_score_is_not_what_the_policy_earns(
     content["score"]["normalized_reward"] = 0.99
     (finished / "score.json").write_text(json.dumps(content))
     assert cli.main(["evaluate", "one"]) == 0
-    assert "DIFFERENT from one/score.json" in capsys.readouterr().out
+    assert "one/score.json: compared bit for bit: DIFFERENT" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("finished")
-def test_evaluate_with_other_starts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["evaluate", "one", "--episodes", "7", "--seed", "5"]) == 0
-    out = capsys.readouterr().out
-    assert "7 perturbed starts" in out
-    assert "score.json" not in out
+def test_evaluate_replays_where_the_machine_differs(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = record.read_score(finished)
+    content["score"]["origin"]["machine"]["extensions"] = "X86_V9"
+    (finished / "score.json").write_text(json.dumps(content))
+    assert cli.main(["evaluate", "one"]) == 0
+    shown = capsys.readouterr().out
+    assert "compared within 0.05 (extensions X86_V9 there, " in shown
+    assert "physics replayed from the action log bit for bit: equal" in shown
+
+
+def test_a_kept_run_is_an_entry(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["evaluate", "one", "--keep", "board/entry"]) == 0
+    assert "kept in board/entry" in capsys.readouterr().out
+    entry = Path("board/entry")
+    names = {
+        "actions.npz", "config.yaml", "plan.npz", "policy.json", "policy.safetensors",
+        "reference.npz", "score.json", "versions.json",
+    }  # fmt: skip
+    assert {path.name for path in entry.iterdir()} == names
+    for name in names - {"score.json", "actions.npz"}:
+        assert (entry / name).read_bytes() == (finished / name).read_bytes()
+    assert record.read_score(entry) == record.read_score(finished)
+    assert cli.main(["evaluate", "board/entry"]) == 0
+    assert "compared bit for bit: equal" in capsys.readouterr().out
+    assert cli.main(["evaluate", "one", "--keep", "board/entry"]) == 2
+    assert "board/entry exists and nothing is overwritten" in capsys.readouterr().err
+    (finished / "plan.npz").unlink()
+    assert cli.main(["evaluate", "one", "--keep", "other"]) == 2
+    assert "one is no finished two-stage run: it lacks plan.npz" in capsys.readouterr().err
+    assert not Path("other").exists()
 
 
 @pytest.mark.usefixtures("finished")

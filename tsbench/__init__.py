@@ -15,10 +15,17 @@ from tsbench.errors import TsbenchError, unknown
 from tsbench.gl import choose_backend
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import numpy as np
     from dm_control.rl.control import Environment
 
+    from tsbench.evaluation.evaluate import Score
     from tsbench.motion import ReferenceMotion
+    from tsbench.policy import Policy
     from tsbench.sim.batched import BatchedEnvironment
+    from tsbench.sim.push import Push
 
 choose_backend()
 
@@ -27,7 +34,7 @@ try:
 except PackageNotFoundError:  # a checkout on the path that was never installed
     __version__ = "0+unknown"
 
-__all__ = ["TsbenchError", "list_methods", "list_tasks", "load", "load_batched"]
+__all__ = ["TsbenchError", "evaluate", "list_methods", "list_tasks", "load", "load_batched"]
 
 Variant = Literal["planning", "imitation"]
 VARIANTS: tuple[Variant, ...] = ("planning", "imitation")
@@ -54,6 +61,7 @@ def load(
     reference: ReferenceMotion | None = None,
     seed: int | None = None,
     perturbed: bool = False,
+    push: Push | None = None,
     **constants: Any,
 ) -> Environment:
     """One dm_control environment of a task.
@@ -65,6 +73,7 @@ def load(
         reference: what the imitation variant imitates.
         seed: of the random starts, None for fresh entropy.
         perturbed: whether episodes begin near the task's start instead of at it.
+        push: what disturbs every episode.
         constants: changes to what defines the task, for studies.
 
     Raises:
@@ -72,8 +81,8 @@ def load(
     """
     from tsbench.sim.single import environment
 
-    mdp = _variant(name, variant, reference, perturbed, constants)
-    return environment(mdp, seed, perturbed=perturbed)
+    mdp = _variant(name, variant, reference, perturbed, push, constants)
+    return environment(mdp, seed, perturbed=perturbed, push=push)
 
 
 def load_batched(
@@ -84,21 +93,59 @@ def load_batched(
     reference: ReferenceMotion | None = None,
     seed: int = 0,
     perturbed: bool = False,
+    push: Push | None = None,
     threads: int | None = None,
     **constants: Any,
 ) -> BatchedEnvironment[Any]:
     """`count` environments of a task stepped together; arguments otherwise as in `load`.
 
-    `threads` None means all cores.
+    `threads` None means all cores; `push` may be another one for each environment.
     """
     from tsbench.sim.batched import BatchedEnvironment, Physics
     from tsbench.sim.kinematic import Planning
 
-    mdp = _variant(name, variant, reference, perturbed, constants)
+    mdp = _variant(name, variant, reference, perturbed, push, constants)
     dynamics: Any = mdp
     if not isinstance(mdp, Planning):
-        dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed)
+        dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed, push=push)
     return BatchedEnvironment(mdp, dynamics, count, seed)
+
+
+def evaluate(
+    policy: Policy | Path | str | Callable[[np.ndarray], Any],
+    task: str,
+    *,
+    protocol: str = "v1",
+    threads: int | None = None,
+) -> Score:
+    """Scores a policy by the evaluation protocol (`tsbench/evaluation/protocol.py`).
+
+    Args:
+        policy: a `tsbench.policy.Policy`, the directory of one, an ONNX file, or any function of
+            one observation (o,) that returns one action (a,) in [-1, 1]. For stable-baselines3
+            there is `tsbench.adapters.from_sb3`.
+        task: its name.
+        protocol: "v1", or "smoke" for a first look that cannot be ranked.
+        threads: for the physics, None for all cores; the score does not depend on it.
+
+    Raises:
+        TsbenchError: an unknown name, a policy for another task, or one that does not fit.
+    """
+    from pathlib import Path
+
+    from tsbench import adapters, tasks
+    from tsbench.evaluation import protocol as protocols
+    from tsbench.evaluation.evaluate import evaluate as score
+    from tsbench.policy import Policy
+
+    made = tasks.make(task)
+    if protocol not in protocols.PROTOCOLS:
+        raise unknown("protocol", protocol, protocols.PROTOCOLS)
+    if isinstance(policy, (str, Path)):
+        policy = adapters.load(Path(policy), made)
+    if not isinstance(policy, (Policy, adapters.ForeignPolicy)):
+        policy = adapters.from_function(policy, made)
+    return score(policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads)
 
 
 def _variant(
@@ -106,6 +153,7 @@ def _variant(
     variant: str | None,
     reference: ReferenceMotion | None,
     perturbed: bool,
+    push: Push | None,
     constants: dict[str, Any],
 ) -> Any:
     from tsbench import tasks
@@ -118,6 +166,8 @@ def _variant(
     if variant == "planning":
         if perturbed:
             raise TsbenchError("the planning variant has no perturbed starts")
+        if push is not None:
+            raise TsbenchError("the planning variant has no body to push")
         return Planning(task)
     if variant == "imitation":
         if reference is None:

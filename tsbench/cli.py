@@ -217,38 +217,83 @@ def _write_json(path: Path | None, content: Any) -> None:
 
 def _evaluate(words: Sequence[str]) -> None:
     parser = _parser("evaluate")
-    parser.add_argument("run", type=Path, metavar="RUN", help="directory with a policy in it")
-    parser.add_argument("--episodes", type=_episodes, metavar="N", help="perturbed starts (100)")
-    parser.add_argument("--seed", type=_seed, metavar="N", help="of the perturbed starts (0)")
+    parser.add_argument(
+        "policy",
+        metavar="POLICY_OR_RUN",
+        help="directory with a policy in it, .onnx file, stable-baselines3 .zip, zero or random",
+    )
+    parser.add_argument("task", nargs="?", metavar="task=NAME", help="where the policy says none")
+    parser.add_argument("--protocol", metavar="NAME", help="v1 (default) or smoke, for seconds")
+    parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
+    parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
+    help_keep = "copy a finished run and this score into a new directory, as leaderboards/ has it"
+    parser.add_argument("--keep", type=Path, metavar="DIRECTORY", help=help_keep)
     options = parser.parse_args(words)
     from tsbench import record, tables
-    from tsbench.evaluation.evaluate import evaluate
+    from tsbench.evaluation.evaluate import evaluate, perturbed_starts
+    from tsbench.evaluation.protocol import PROTOCOLS, V1
+    from tsbench.evaluation.replay import compare, episode_starts
 
-    chosen = {name: getattr(options, name) for name in ("episodes", "seed")}
-    chosen = {name: value for name, value in chosen.items() if value is not None}
-    policy, task = record.read_policy(options.run)
-    score = evaluate(policy, task, **chosen).as_dict()
-    _write_json(options.json, score)
+    path = Path(options.policy)
+    policy, task = _policy(path, options.task, options.trust_sb3)
+    finished = path.is_dir() and (path / record.SCORE).exists()
+    kept = record.read_score(path) if finished else None
+    if options.keep is not None:
+        record.check_keep(path, options.keep)
+    name = options.protocol or (kept["score"].get("protocol", V1.name) if kept else V1.name)
+    if name not in PROTOCOLS:
+        raise unknown("protocol", name, PROTOCOLS)
+    protocol = PROTOCOLS[name]
+    score = evaluate(policy, task, protocol=protocol, threads=options.threads)
+    content = score.as_dict()
+    _write_json(options.json, content)
     console = Console()
-    console.print(tables.score_table(f"{task.name}: {options.run}", score))
-    if not chosen and (options.run / record.SCORE).exists():
-        same = score == record.read_score(options.run)["score"]
-        verdict = "equal to" if same else "DIFFERENT from"
-        console.print(f" {verdict} {options.run / record.SCORE}", highlight=False, soft_wrap=True)
+    console.print(tables.score_table(f"{task.name}: {options.policy}", content))
+    if kept is not None:
+        log = record.read_actions(path)
+        starts = episode_starts(task, perturbed_starts(task, protocol))
+        comparison = compare(kept["score"], content, protocol, task, starts, log)
+        line = f" {path / record.SCORE}: {comparison.words}"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if options.keep is not None:
+        record.keep(path, options.keep, content, score.log)
+        console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _episodes(word: str) -> int:
-    return _whole_number(word, 1, 1_000_000)
+def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
+    """A policy and the task to evaluate it in.
+
+    Raises:
+        TsbenchError: there is no such policy, or the word for the task is missing or wrong.
+    """
+    from tsbench import adapters, record, tasks
+    from tsbench.evaluation import references
+
+    name = None
+    if word is not None:
+        key, separator, name = word.partition("=")
+        if key != "task" or not separator:
+            raise TsbenchError(f"expected task=NAME, not {word!r}")
+        if name not in tasks.names():
+            raise unknown("task", name, tasks.names())
+    if path.is_dir():
+        policy, task = record.read_policy(path)
+        if name not in (None, task.name):
+            raise TsbenchError(f"{path} holds a policy for {task.name}, not for {name}")
+        return policy, task
+    if name is None:
+        if path.exists() or str(path) in references.POLICIES:
+            raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
+        raise TsbenchError(f"no run directory {path}")
+    task = tasks.make(name)
+    if str(path) in references.POLICIES and not path.exists():
+        return references.POLICIES[str(path)](task), task
+    return adapters.load(path, task, trust_sb3), task
 
 
-def _seed(word: str) -> int:
-    return _whole_number(word, 0, 2**32 - 1)
-
-
-def _whole_number(word: str, lowest: int, highest: int) -> int:
-    if not (word.isdecimal() and lowest <= int(word) <= highest):
-        message = f"must be a whole number from {lowest} to {highest}, not {word!r}"
-        raise argparse.ArgumentTypeError(message)
+def _threads(word: str) -> int:
+    if not (word.isdecimal() and 1 <= int(word) <= 1024):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1024, not {word!r}")
     return int(word)
 
 
@@ -294,7 +339,7 @@ def _bench(words: Sequence[str]) -> None:
 
 VERBS = {
     "run": Verb("train a policy and evaluate it", _run),
-    "evaluate": Verb("score a policy from its file alone", _evaluate),
+    "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
     "view": Verb("write a page that plays a run's motion", _view),
     "bench": Verb("measure how fast it is, side by side with others", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),

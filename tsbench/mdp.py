@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Self, TypeVar, cast
 
@@ -22,6 +22,7 @@ from tsbench.motion import Audit, Plan, ReferenceMotion
 
 Array = Any  # an array of any library that follows the array API standard
 Rng = np.random.Generator
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,16 @@ class Start:
     qpos: np.ndarray
     qvel: np.ndarray
     memory: np.ndarray
+
+    def rows(self, rows: np.ndarray | slice) -> Start:
+        """Some of the starts."""
+        return Start(self.time[rows], self.qpos[rows], self.qvel[rows], self.memory[rows])
+
+    @classmethod
+    def joined(cls, starts: Sequence[Start]) -> Start:
+        """All of them, one after the other."""
+        fields = [field.name for field in dataclasses.fields(cls)]
+        return cls(*(np.concatenate([getattr(start, f) for start in starts]) for f in fields))
 
 
 @dataclass(frozen=True)
@@ -191,6 +202,10 @@ class Task(MDP[S]):
     """An MDP in full physics, with a sparse reward."""
 
     substeps: int  # physics steps in one control step
+    pushed: str  # the body that pushes act on, at its centre of mass
+    push_plane: tuple[
+        Vector, Vector
+    ]  # world axes: a push has a heading from the first to the second
     imitation_forms: tuple[str, ...]  # tracking rewards on offer, the default first
 
     @abstractmethod
@@ -209,6 +224,10 @@ class Task(MDP[S]):
     def read(self, readings: Readings) -> S:
         """The task's state from what the physics tells."""
 
+    def memory(self, state: S) -> Array:
+        """What `control` remembered on the way to a state, shape (..., m); by default nothing."""
+        return state.time[..., None][..., :0]
+
     @abstractmethod
     def success(self, state: S) -> Array:
         """Whether an episode that ends in `state`, without violation, counts as solved."""
@@ -216,6 +235,11 @@ class Task(MDP[S]):
     @abstractmethod
     def goal_distance(self, state: S) -> Array:
         """Metres between robot and goal, shape (...,)."""
+
+    @property
+    @abstractmethod
+    def push_steps(self) -> tuple[int, ...]:
+        """The control steps at which the protocol's pushes begin: the phases of the motion."""
 
     @abstractmethod
     def ideal(self) -> S:

@@ -169,6 +169,29 @@ class ReferenceMotion(_Recording):
 
 
 @dataclass(frozen=True)
+class ActionLog(_Recording):
+    """What a policy did in some episodes, to replay their physics from.
+
+    Attributes:
+        actions: of the nominal and then the perturbed episodes, shape (T, n, action_size).
+        rewards: that they earned, shape (T, n); zero once an episode has ended.
+    """
+
+    kind: ClassVar[str] = "action log"
+    time_axes: ClassVar[dict[str, int]] = {"actions": 3, "rewards": 2}
+
+    actions: np.ndarray
+    rewards: np.ndarray
+
+    def _problem(self) -> str | None:
+        if problem := super()._problem():
+            return problem
+        if self.actions.shape[:2] != self.rewards.shape:
+            return f"actions {self.actions.shape} and rewards {self.rewards.shape} do not match"
+        return None
+
+
+@dataclass(frozen=True)
 class AuditItem:
     """One measured property of a plan or reference motion against what is allowed."""
 

@@ -103,28 +103,33 @@ class Policy:
         Each row is computed by itself: matrix products over several rows round differently, and
         an action must not depend on what else is in the batch.
         """
-        rows = np.asarray(observation, np.float32).reshape(-1, len(self.mean))
-        actions = np.stack([self._forward(row) for row in rows])
-        return actions.reshape(*observation.shape[:-1], -1).astype(np.float64)
-
-    def _forward(self, x: np.ndarray) -> np.ndarray:
         activation = ACTIVATIONS[self.info.activation]
-        x = (ENCODINGS[self.info.encoding](x) - self.mean) / self.scale
+        encoded = ENCODINGS[self.info.encoding](np.asarray(observation, np.float32))
+        x = (encoded - self.mean) / self.scale
         last = len(self.weights) - 1
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = weight @ x + bias
+            x = (weight @ x[..., None])[..., 0] + bias  # a product of its own for every row
             if i < last:
                 x = activation(x)
-        return np.clip(x, -1.0, 1.0)
+        return np.clip(x, -1.0, 1.0).astype(np.float64)
 
-    def save(self, directory: Path | str) -> None:
-        """Writes policy.safetensors and policy.json into the directory."""
-        directory = Path(directory)
+    def _content(self) -> bytes:
+        """Of `policy.safetensors`."""
         tensors = {"mean": self.mean, "scale": self.scale}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             tensors[f"weight_{i}"] = np.ascontiguousarray(weight)
             tensors[f"bias_{i}"] = np.ascontiguousarray(bias)
-        content = save(tensors)
+        return save(tensors)
+
+    @property
+    def sha256(self) -> str:
+        """Of `policy.safetensors`, saved or not."""
+        return hashlib.sha256(self._content()).hexdigest()
+
+    def save(self, directory: Path | str) -> None:
+        """Writes policy.safetensors and policy.json into the directory."""
+        directory = Path(directory)
+        content = self._content()
         info = asdict(self.info) | {"sha256": hashlib.sha256(content).hexdigest()}
         write_whole(directory / "policy.safetensors", content)
         write_whole(directory / "policy.json", (json.dumps(info, indent=2) + "\n").encode())

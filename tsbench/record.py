@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError, os_errors
 from tsbench.files import write_whole
 from tsbench.mdp import Task
+from tsbench.motion import ActionLog
 from tsbench.policy import Policy
 from tsbench.typed import typed
 
@@ -26,8 +29,11 @@ REFERENCE = "reference.npz"
 DUMP = "not-finite.npz"
 CHECKPOINTS = "checkpoints"
 SCORE = "score.json"
+ACTIONS = "actions.npz"
 CURVES = "learning_curves.png"
 PAGE = "view.html"
+# What an entry keeps of a run; the first line of its configuration is the command.
+KEPT = (CONFIG, VERSIONS, "policy.json", "policy.safetensors", PLAN, REFERENCE, SCORE)
 
 
 def read_config(directory: Path) -> RunConfig:
@@ -84,6 +90,47 @@ def read_policy(directory: Path) -> tuple[Policy, Task[Any]]:
     return policy, tasks.make(policy.info.task, **constants)
 
 
+def read_actions(directory: Path) -> ActionLog | None:
+    """The action log of a run, if it has one.
+
+    Raises:
+        TsbenchError: the file is damaged.
+    """
+    path = directory / ACTIONS
+    return ActionLog.load(path) if path.exists() else None
+
+
+def check_keep(run: Path, entry: Path) -> None:
+    """
+    Raises:
+        TsbenchError: `keep` could not work, whatever the score.
+    """
+    missing = [name for name in KEPT if not (run / name).exists()]
+    if missing:
+        raise TsbenchError(f"{run} is no finished two-stage run: it lacks {', '.join(missing)}")
+    if not tasks.standard(read_policy(run)[1]):
+        raise TsbenchError(f"{run} was made with changed constants: it cannot be an entry")
+    if entry.exists():
+        raise TsbenchError(f"{entry} exists and nothing is overwritten")
+
+
+def keep(run: Path, entry: Path, score: dict[str, Any], log: ActionLog) -> None:
+    """Copies what matters of a run into a new directory, with a score made now.
+
+    Raises:
+        TsbenchError: the run is not finished, or the directory exists or cannot be written.
+    """
+    check_keep(run, entry)
+    content = read_score(run) | {"score": score}
+    with os_errors(entry):
+        entry.mkdir(parents=True)
+        for name in KEPT:
+            if name != SCORE:
+                shutil.copy(run / name, entry / name)
+        log.save(entry / ACTIONS)
+    write_json(entry / SCORE, content)
+
+
 def write_json(path: Path, content: Any) -> None:
     """Writes a JSON file; nothing is overwritten.
 
@@ -93,4 +140,9 @@ def write_json(path: Path, content: Any) -> None:
     if path.exists():
         raise TsbenchError(f"{path} exists and nothing is overwritten")
     with os_errors(path):
-        write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
+        write_whole(path, (_legible(json.dumps(content, indent=2)) + "\n").encode())
+
+
+def _legible(text: str) -> str:
+    """JSON with every list of plain values on one line."""
+    return re.sub(r"\[[^][{}\"]*\]", lambda found: " ".join(found[0].split()), text)

@@ -27,10 +27,12 @@ from tsbench import curves, methods, tables, tasks
 from tsbench.config import RunConfig
 from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.evaluation.evaluate import Score, evaluate
+from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.files import PART, write_whole
 from tsbench.motion import ReferenceMotion
 from tsbench.problem import Problem
 from tsbench.record import (
+    ACTIONS,
     CHECKPOINTS,
     CONFIG,
     CURVES,
@@ -247,7 +249,9 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
     directory = workspace.directory
     policy = methods.find(config.method["name"]).train(problem, workspace)
     policy.save(directory)
-    score = evaluate(policy, problem.task)
+    protocol = SMOKE if config.budget == SMOKE.name else V1
+    score = evaluate(policy, problem.task, protocol=protocol, threads=problem.threads)
+    score.log.save(directory / ACTIONS)
     record = {
         "task": problem.task.name,
         "task_version": problem.task.version,

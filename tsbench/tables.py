@@ -29,7 +29,7 @@ def number(value: Any) -> str:
 
 
 def score_table(title: str, score: Mapping[str, Any]) -> Table:
-    """A score: the task's own start beside the perturbed ones.
+    """A score: the task's own start beside the perturbed ones, changed physics, and pushes.
 
     Args:
         title: what was scored.
@@ -37,7 +37,7 @@ def score_table(title: str, score: Mapping[str, Any]) -> Table:
     """
     nominal, perturbed = score["nominal"], score["perturbed"]
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("")
+    table.add_column(f"protocol {score['protocol']}")
     table.add_column("task's own start", justify="right")
     table.add_column(f"{perturbed['episodes']} perturbed starts", justify="right")
     table.add_row(
@@ -49,6 +49,19 @@ def score_table(title: str, score: Mapping[str, Any]) -> Table:
     for name in nominal:
         if name not in ("episodes", "normalized_reward"):
             table.add_row(name, number(nominal[name]), number(perturbed[name]))
+    table.add_section()
+    table.add_row("changed physics", "normalized_reward", "success", style="bold")
+    for name, change in score["changes"].items():
+        table.add_row(name, number(change["normalized_reward"]), number(change["success"]))
+    robustness = score["robustness"]
+    low, high = robustness["survival_100N_interval"]
+    bound = "at least " if robustness["impulse_50_is_lower_bound"] else ""
+    table.add_section()
+    table.add_row("pushes", style="bold")
+    table.add_row(
+        "survival_100N", number(robustness["survival_100N"]), f"95 %: {low:.3f} to {high:.3f}"
+    )
+    table.add_row("impulse_50", f"{bound}{number(robustness['impulse_50'])}", "N s")
     return table
 
 
@@ -82,4 +95,8 @@ def summary(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Labels and values of a run's score in short."""
     score = record["score"]
     names = ("normalized_reward", "optimality", "success")
-    return [(name, number(score[name])) for name in names]
+    pushed = ("survival_100N", "impulse_50")
+    return [
+        *((name, number(score[name])) for name in names),
+        *((name, number(score["robustness"][name])) for name in pushed),
+    ]

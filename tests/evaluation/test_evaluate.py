@@ -13,6 +13,7 @@ import pytest
 import tsbench
 from tsbench import TsbenchError, tasks
 from tsbench.evaluation.evaluate import best_return, check_fit, evaluate
+from tsbench.evaluation.protocol import SMOKE, Protocol
 from tsbench.policy import Policy, PolicyInfo
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import fingerprint
@@ -24,6 +25,11 @@ COS30 = 0.8660254037844387
 
 def idle(size: int) -> PolicyFunction:
     return lambda observation: np.zeros((len(observation), size))
+
+
+def few(episodes: int) -> Protocol:
+    """A protocol of seconds."""
+    return replace(SMOKE, perturbed=episodes, phases=16, forces=(100.0,), headings=2)
 
 
 def artefact(name: str, seed: int = 0, **constants: Any) -> Policy:
@@ -70,7 +76,7 @@ def test_a_falling_rocket(distance: float, horizon: int) -> None:
     assert task.horizon == horizon
     total, length = fall(distance, horizon)
     assert (length < horizon) == (distance > 10.0)
-    score = evaluate(idle(2), task, episodes=3, threads=1)
+    score = evaluate(idle(2), task, protocol=few(3), threads=1)
     assert score.normalized_reward == pytest.approx(total / (0.9 * horizon), rel=1e-9)
     assert score.optimality == pytest.approx(total / best_return(task), rel=1e-9)
     assert score.success == 0.0
@@ -99,7 +105,7 @@ def pilot(observation: np.ndarray) -> np.ndarray:
 
 def test_a_pilot_arrives() -> None:
     """The standard task can be solved, from every perturbed start too."""
-    score = evaluate(pilot, tasks.make("rocket_navigation"), episodes=10, threads=1)
+    score = evaluate(pilot, tasks.make("rocket_navigation"), protocol=few(10), threads=1)
     assert (score.success, score.perturbed.success) == (1.0, 1.0)
     assert score.nominal.goal_distance < 1.0
     assert 0.3 < score.optimality < 1.0
@@ -109,7 +115,7 @@ def test_a_pilot_arrives() -> None:
 def test_a_standing_robot() -> None:
     """It neither falls nor arrives, and its score is that of the dm_control environment."""
     task = tasks.make("laikago_walk")
-    score = evaluate(idle(12), task, episodes=4, threads=1)
+    score = evaluate(idle(12), task, protocol=few(4), threads=1)
     assert score.success == score.perturbed.success == 0.0
     assert score.nominal.violations == score.perturbed.violations == 0.0
     assert score.nominal.steps == 180
@@ -121,7 +127,7 @@ def test_a_standing_robot() -> None:
 @pytest.mark.parametrize("name", tasks.names())
 def test_the_score_is_the_dm_control_environments(name: str) -> None:
     policy, task = artefact(name), tasks.make(name)
-    score = evaluate(policy, task, episodes=2, threads=1)
+    score = evaluate(policy, task, protocol=few(2), threads=1)
     environment = tsbench.load(name)
     time_step = environment.reset()
     rewards = []
@@ -141,9 +147,9 @@ def test_the_score_is_the_dm_control_environments(name: str) -> None:
 
 def test_repeatable() -> None:
     policy, task = artefact("laikago_trot"), tasks.make("laikago_trot")
-    score = evaluate(policy, task, episodes=5, threads=1)
-    assert evaluate(policy, task, episodes=5, threads=2) == score
-    other = evaluate(policy, task, episodes=5, threads=1, seed=1)
+    score = evaluate(policy, task, protocol=few(5), threads=1)
+    assert evaluate(policy, task, protocol=few(5), threads=2) == score
+    other = evaluate(policy, task, protocol=replace(few(5), seed=1), threads=1)
     assert other.nominal == score.nominal
     assert other.perturbed != score.perturbed
     assert json.loads(json.dumps(score.as_dict()))["perturbed"]["episodes"] == 5
@@ -158,7 +164,7 @@ def test_success_needs_an_episode_without_violation() -> None:
 
     task = tasks.make("rocket_navigation")
     harsh = Harsh(**task.constants())
-    score = evaluate(pilot, harsh, episodes=2, threads=1)
+    score = evaluate(pilot, harsh, protocol=few(2), threads=1)
     assert score.nominal.goal_distance < 1.0
     assert score.success == score.perturbed.success == 0.0
     assert score.nominal.violations == score.perturbed.violations == 1.0
@@ -265,6 +271,6 @@ def test_foreign_policies_are_refused(change: dict[str, Any], message: str) -> N
     policy, task = artefact("laikago_walk"), tasks.make("laikago_walk")
     check_fit(policy, task)
     with pytest.raises(TsbenchError, match=message):
-        evaluate(replace(policy, info=replace(policy.info, **change)), task, episodes=1)
+        evaluate(replace(policy, info=replace(policy.info, **change)), task, protocol=few(1))
     with pytest.raises(TsbenchError, match="another model or other constants"):
-        evaluate(policy, tasks.make("laikago_walk", distance=1.0), episodes=1)
+        evaluate(policy, tasks.make("laikago_walk", distance=1.0), protocol=few(1))

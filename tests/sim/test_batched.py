@@ -247,25 +247,6 @@ def test_states_are_not_overwritten() -> None:
     assert laikago.substeps == 60
 
 
-def test_a_push_moves_the_body_and_is_equal() -> None:
-    """100 N to the left on the trunk for three control steps."""
-    task = tasks.make("laikago_trot")
-    physics = Physics(task, 2, threads=1)
-    state = physics.begin(np.random.default_rng(0), np.arange(2))
-    single = tsbench.load("laikago_trot")
-    single.reset()
-    trunk = single.physics.model.name2id("trunk", "body")
-    pushes = physics.batch.bind("xfrc_applied")
-    for step in range(20):
-        force = 100.0 if 5 <= step < 8 else 0.0
-        pushes[0, trunk, 1] = force
-        single.physics.data.xfrc_applied[trunk, 1] = force
-        state = physics.advance(state, np.zeros((2, 12)))
-        single.step(np.zeros(12))
-        assert same(state.rows(slice(0, 1)), cast(Any, single.task).state)
-    assert state.base_position[0, 1] > state.base_position[1, 1] + 0.01
-
-
 def test_truncation_and_termination() -> None:
     """An episode that ends in a terminal state at its last step is terminal."""
     task = tasks.make("rocket_navigation")

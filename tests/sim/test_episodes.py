@@ -20,10 +20,12 @@ class Line(State):
 
     Attributes:
         x: metres, shape (...,).
+        speed: metres that its policy wants a step to have, shape (...,).
         hurt: whether it happened on this step, shape (...,).
     """
 
     x: Array
+    speed: Array
     hurt: Array
 
 
@@ -31,16 +33,16 @@ class Walk(MDP[Line]):
     """Reward: the distance walked. The goal is x = 4, the cliff x = -3; 7 hurts; 5 is both."""
 
     name, version, horizon, timestep = "walk", 1, HORIZON, 0.5
-    observation_size, action_size, max_reward = 2, 1, 2.0
+    observation_size, action_size, max_reward = 3, 1, 2.0
     diverged = np.zeros(0, int)
     seconds = 0.0  # of physics
 
-    def __init__(self, starts: list[float]) -> None:
-        self.starts = starts
-        self.advanced = 0
+    def __init__(self, starts: list[float], speeds: list[float]) -> None:
+        self.starts, self.speeds = np.array(starts), np.array(speeds)
+        self.advanced: list[int] = []  # how many walkers, each time
 
     def observation(self, state: Line) -> Array:
-        return np.stack([state.time, state.x], axis=-1)
+        return np.stack([state.time, state.x, state.speed], axis=-1)
 
     def reward(self, previous: Line, action: Array, state: Line) -> Array:
         return state.x - previous.x
@@ -56,18 +58,25 @@ class Walk(MDP[Line]):
 
     def begin(self, rng: np.random.Generator, rows: np.ndarray) -> Line:
         self.drawn = float(rng.uniform())
-        x = np.array(self.starts)[rows]
-        return Line(np.zeros(len(rows)), x, np.zeros(len(rows), bool))
+        return Line(
+            np.zeros(len(rows)), self.starts[rows], self.speeds[rows], np.zeros(len(rows), bool)
+        )
 
-    def advance(self, state: Line, action: Array) -> Line:
-        self.advanced += 1
+    def advance(self, state: Line, action: Array, rows: np.ndarray | None = None) -> Line:
+        assert rows is not None
+        np.testing.assert_array_equal(state.speed, self.speeds[rows])
+        self.advanced.append(len(rows))
         x = state.x + action[..., 0]
-        return Line(state.time + self.timestep, x, np.isin(x, [5.0, 7.0]))
+        return Line(state.time + self.timestep, x, state.speed, np.isin(x, [5.0, 7.0]))
+
+
+def wanted(observation: np.ndarray) -> np.ndarray:
+    return observation[:, 2:]
 
 
 def walk(starts: list[float], speeds: list[float], **options: Any) -> Episodes[Line]:
-    mdp = Walk(starts)
-    return play(mdp, mdp, lambda _: np.array(speeds)[:, None], len(starts), seed=0, **options)
+    mdp = Walk(starts, speeds)
+    return play(mdp, mdp, wanted, len(starts), seed=0, **options)
 
 
 @pytest.mark.parametrize(
@@ -117,26 +126,66 @@ def test_many_side_by_side() -> None:
 
 
 def test_record_after_the_last_end() -> None:
-    """Play stops when nobody is left; the record is as long as ever."""
-    mdp = Walk([0.0, 0.0])
-    steps: list[int] = []
+    """Play stops when nobody is left, and whoever has ended is left alone before; the record is as
+    long as ever."""
+    mdp = Walk([0.0, 0.0], [2.0, -1.0])
     episodes = play(
-        mdp, mdp, lambda _: np.array([[2.0], [-1.0]]), 2, seed=0,
-        record=lambda state: np.stack([state.x, state.time], axis=-1), disturb=steps.append,
-    )  # fmt: skip
-    assert mdp.advanced == 3
-    assert steps == [0, 1, 2]
+        mdp, mdp, wanted, 2, record=lambda state: np.stack([state.x, state.time], axis=-1)
+    )
+    assert mdp.advanced == [2, 2, 1]
     assert episodes.states is not None
     assert episodes.states.shape == (HORIZON + 1, 2, 2)
     assert episodes.states[-1].tolist() == [[4.0, 1.0], [-3.0, 1.5]]
     assert walk([0.0], [1.0]).states is None
 
 
+@pytest.mark.parametrize(
+    ("start", "speed", "survived"),
+    [
+        (0.0, 1.0, True),  # at the goal
+        (0.0, 0.25, True),  # to the last step
+        (1.5, 0.25, True),  # both
+        (0.0, -1.0, False),  # over the cliff
+        (6.0, 0.125, False),  # to the last step, but hurt at 7
+        (6.0, -1.0, False),  # at the goal, but hurt
+        (-1.75, -0.125, False),  # over the cliff with the last step
+    ],
+)
+def test_survival(start: float, speed: float, survived: bool) -> None:
+    assert walk([start], [speed]).survived.tolist() == [survived]
+
+
+def test_going_on_from_states() -> None:
+    """Episodes that begin late have fewer steps, each its own number; only those count."""
+    mdp = Walk([0.0] * 3, [0.25, 1.0, 0.25])
+    begin = Line(
+        np.array([4.0, 2.0, 0.0]), np.array([0.0, 0.0, 1.0]), mdp.speeds, np.zeros(3, bool)
+    )
+    episodes = play(mdp, mdp, wanted, 3, begin=begin)
+    assert episodes.limits.tolist() == [2, 6, 10]
+    assert episodes.lengths.tolist() == [2, 4, 10]
+    assert episodes.survived.tolist() == [True, True, True]
+    assert episodes.returns.tolist() == pytest.approx([0.5, 4.0 + 2 * 2.0, 2.5])
+    assert episodes.normalized.tolist() == pytest.approx([0.5 / 4.0, 8.0 / 12.0, 2.5 / 20.0])
+    assert episodes.final.time.tolist() == [5.0, 4.0, 5.0]
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 3])
+def test_late_actions(delay: int) -> None:
+    """The action of each step is the one wanted `delay` steps before, zero at first."""
+    mdp = Walk([0.0, 0.5], [0.0, 0.0])
+    episodes = play(mdp, mdp, lambda observation: 0.1 + 0.01 * observation[:, :1], 2, delay=delay)
+    expected = [0.0] * delay + [0.1 + 0.005 * step for step in range(HORIZON - delay)]
+    for row in range(2):
+        assert episodes.actions[:, row, 0].tolist() == pytest.approx(expected)
+    assert episodes.final.x[0] == pytest.approx(sum(expected))
+
+
 def test_the_seed_is_the_starts() -> None:
     drawn = []
     for seed in (3, 3, 4):
-        mdp = Walk([0.0])
-        play(mdp, mdp, lambda _: np.zeros((1, 1)), 1, seed)
+        mdp = Walk([0.0], [0.0])
+        play(mdp, mdp, wanted, 1, seed)
         drawn.append(mdp.drawn)
     assert drawn[0] == drawn[1] != drawn[2]
 
@@ -149,6 +198,6 @@ def test_the_policy_sees_the_present() -> None:
         seen.append(observation.tolist())
         return np.array([[0.5]])
 
-    mdp = Walk([0.0])
+    mdp = Walk([0.0], [0.0])
     play(mdp, mdp, policy, 1, seed=0)
-    assert seen == [[[0.5 * step, 0.5 * step]] for step in range(8)]
+    assert seen == [[[0.5 * step, 0.5 * step, 0.0]] for step in range(8)]

@@ -1,21 +1,23 @@
-"""The score of a policy on a task."""
+"""The score of a policy on a task, by a protocol."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from tsbench.errors import TsbenchError
-from tsbench.mdp import Task
+from tsbench.evaluation.protocol import V1, Protocol
+from tsbench.evaluation.replay import Origin
+from tsbench.evaluation.robustness import Robustness, robustness
+from tsbench.mdp import Start, Task
+from tsbench.motion import ActionLog
 from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
+from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
-
-EPISODES = 100  # with perturbed starts
-SEED = 0
 
 
 @dataclass(frozen=True)
@@ -42,50 +44,92 @@ class Summary:
 @dataclass(frozen=True)
 class Score:
     """Attributes:
+    protocol: its name.
     normalized_reward: of the episode from the task's own start.
     optimality: its return over that of the best motion known (`Task.ideal`).
     success: whether that episode was solved, 0 or 1.
     nominal: that episode.
     perturbed: episodes from perturbed starts.
-    seed: of the perturbed starts.
+    changes: episodes in changed physics, by the name of the condition.
+    robustness: survival under pushes.
+    origin: what it depends on.
+    log: actions to replay the physics from.
     """
 
+    protocol: str
     normalized_reward: float
     optimality: float
     success: float
     nominal: Summary
     perturbed: Summary
-    seed: int
+    changes: dict[str, Summary]
+    robustness: Robustness
+    origin: Origin
+    log: ActionLog = field(compare=False, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        """Plain values, all but the log."""
+        values = {name: value for name, value in vars(self).items() if name != "log"}
+        for name in ("nominal", "perturbed", "robustness", "origin"):
+            values[name] = asdict(values[name])
+        return values | {"changes": {name: asdict(part) for name, part in self.changes.items()}}
 
 
 def evaluate(
     policy: PolicyFunction,
     task: Task[Any],
     *,
-    episodes: int = EPISODES,
-    seed: int = SEED,
+    protocol: Protocol = V1,
     threads: int | None = None,
 ) -> Score:
-    """Plays the task's own start once and `episodes` perturbed starts.
+    """Scores a policy. `threads` None means all cores, and changes nothing but the time.
 
     Raises:
         TsbenchError: the policy was trained for another task, version or physics.
     """
     if isinstance(policy, Policy):
         check_fit(policy, task)
-    nominal = _play(policy, task, 1, seed, threads, perturbed=False)
-    perturbed = _play(policy, task, episodes, seed, threads, perturbed=True)
+    nominal = play(task, Physics(task, 1, threads=threads), policy, 1)
+    starts = perturbed_starts(task, protocol)
+    perturbed = _play(policy, task, starts, threads)
+    some = starts.rows(slice(0, protocol.changed))
     first = _summary(task, nominal)
     return Score(
+        protocol=protocol.name,
         normalized_reward=first.normalized_reward,
         optimality=float(nominal.returns[0]) / best_return(task),
         success=first.success,
         nominal=first,
         perturbed=_summary(task, perturbed),
-        seed=seed,
+        changes={
+            condition.name: _summary(
+                task, _play(policy, task, some, threads, condition.change, condition.delay)
+            )
+            for condition in protocol.conditions
+        },
+        robustness=robustness(policy, task, protocol, threads),
+        origin=Origin.here(task, protocol, policy),
+        log=ActionLog(
+            task=task.name,
+            task_version=task.version,
+            timestep=task.timestep,
+            actions=_logged(nominal.actions, perturbed.actions, protocol),
+            rewards=_logged(nominal.rewards, perturbed.rewards, protocol),
+        ),
+    )
+
+
+def _logged(nominal: np.ndarray, perturbed: np.ndarray, protocol: Protocol) -> np.ndarray:
+    return np.concatenate([nominal, perturbed[:, : protocol.logged]], axis=1)
+
+
+def perturbed_starts(task: Task[Any], protocol: Protocol) -> Start:
+    """Episode i starts as a dm_control environment of the task seeded with (seed, i) does."""
+    return Start.joined(
+        [
+            task.start(np.random.default_rng((protocol.seed, episode)), 1, perturbed=True)
+            for episode in range(protocol.perturbed)
+        ]
     )
 
 
@@ -120,14 +164,15 @@ def best_return(task: Task[Any]) -> float:
 def _play(
     policy: PolicyFunction,
     task: Task[Any],
-    count: int,
-    seed: int,
+    starts: Start,
     threads: int | None,
-    *,
-    perturbed: bool,
+    change: Change | None = None,
+    delay: int = 0,
 ) -> Episodes[Any]:
-    physics: Physics[Any] = Physics(task, count, threads=threads, perturbed=perturbed)
-    return play(task, physics, policy, count, seed)
+    count = len(starts.time)
+    physics: Physics[Any] = Physics(task, count, threads=threads, change=change)
+    begin = physics.place(np.arange(count), starts)
+    return play(task, physics, policy, count, begin=begin, delay=delay)
 
 
 def _summary(task: Task[Any], episodes: Episodes[Any]) -> Summary:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from tsbench.errors import TsbenchError, unknown
@@ -10,14 +11,24 @@ from tsbench.mdp import Task
 from tsbench.problem import Monitor, Problem, Workspace
 from tsbench.rl.ppo import Learner, PPOSettings, Report
 from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
 from tsbench.typed import typed_items
 
 KINDS = ("plan", "imitate", "task", "finetune")
 
 
-def settings(problem: Problem, kind: str) -> PPOSettings:
-    """The PPO settings of a kind of stage. Those of `finetune`, which goes on with the imitation
+@dataclass(frozen=True)
+class StageSettings(PPOSettings):
+    """Attributes:
+    disturb: what is random about the physics that is learned in.
+    """
+
+    disturb: Disturbances = field(default_factory=Disturbances)
+
+
+def settings(problem: Problem, kind: str) -> StageSettings:
+    """The settings of a kind of stage. Those of `finetune`, which goes on with the imitation
     stage's policy, are changes to those of `imitate`.
 
     Raises:
@@ -28,11 +39,11 @@ def settings(problem: Problem, kind: str) -> PPOSettings:
     changes: dict[str, Any] = {}
     for name in ("imitate", "finetune") if kind == "finetune" else (kind,):
         given = problem.training.get(name, {})
-        changes |= typed_items(PPOSettings, given, f"task.training.{name}")
+        changes |= typed_items(StageSettings, given, f"task.training.{name}")
     if problem.budget.environments is not None:
         changes["environments"] = problem.budget.environments
     try:
-        return PPOSettings(**changes)
+        return StageSettings(**changes)
     except ValueError as error:
         raise TsbenchError(f"task.training.{kind}.{error}") from None
 
@@ -66,9 +77,12 @@ def learn_physics(
     steps: int,
     start_from: Learner | None = None,
 ) -> Learner:
-    """PPO on a task in full physics, or on its imitation variant."""
+    """PPO on a task in full physics, or on its imitation variant, under the disturbances that the
+    stage's settings ask for."""
     chosen = settings(problem, kind)
-    physics: Physics[Any] = Physics(task, chosen.environments, threads=problem.threads)
+    physics: Physics[Any] = DisturbedPhysics(
+        task, chosen.environments, chosen.disturb, problem.seed, threads=problem.threads
+    )
     environment = BatchedEnvironment(task, physics, chosen.environments, problem.seed)
     with workspace.stage(name, steps) as monitor:
         learner = Learner(environment, chosen, problem.seed, start_from)

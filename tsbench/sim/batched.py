@@ -21,7 +21,9 @@ from mujoco.batch import Batch, SimulationError
 
 from tsbench.errors import NotFiniteError, TsbenchError
 from tsbench.mdp import MDP, Array, Readings, Rng, S, Start, State, Task
+from tsbench.sim.change import Change
 from tsbench.sim.model import UNSTABLE, sensor_slices
+from tsbench.sim.push import Push
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 _NUMBER = 1  # of a kind of warning, beside what it was about, in `Batch.warning`
@@ -50,8 +52,8 @@ class Dynamics(Protocol[S]):
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         """Starts new episodes in `rows` and returns their states."""
 
-    def advance(self, state: S, action: Array) -> S:
-        """The states of all episodes one time step later."""
+    def advance(self, state: S, action: Array, rows: np.ndarray | None = None) -> S:
+        """The states one time step later, of all episodes or only of those in `rows`."""
 
 
 class LastingDynamics(Dynamics[S], Protocol[S]):
@@ -68,7 +70,8 @@ class Physics(Generic[S]):
     """A task's full physics.
 
     Attributes:
-        batch: the simulations; a write to `batch.xfrc_applied` pushes them.
+        batch: the simulations.
+        push: what disturbs the episodes, or None.
         substeps: physics steps done so far, all episodes together.
         warnings: how often mujoco has warned, of each kind (mjtWarning), all episodes together.
         diverged: rows in which mujoco met a number that is not finite, or huge, in the last step.
@@ -77,11 +80,19 @@ class Physics(Generic[S]):
     """
 
     def __init__(
-        self, task: Task[S], count: int, *, threads: int | None = None, perturbed: bool = False
+        self,
+        task: Task[S],
+        count: int,
+        *,
+        threads: int | None = None,
+        perturbed: bool = False,
+        push: Push | None = None,
+        change: Change | None = None,
     ) -> None:
         """`threads` None means all cores; `perturbed` picks the task's perturbed starts."""
         self.task = task
         self.perturbed = perturbed
+        self.push = push
         self.substeps = 0
         self.seconds = 0.0
         self.warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), int)
@@ -89,6 +100,8 @@ class Physics(Generic[S]):
         spec = task.spec()
         spec.compiler.discardvisual = True  # 10 % faster, the same states to the last bit
         model = spec.compile()
+        if change is not None:
+            change.apply(model)
         # With memory of its own a simulation goes on from the sensors that were brought up to date,
         # which otherwise costs half a substep; among twenty substeps that does not pay.
         self.batch = Batch(model, count, threads or 0, persistent=task.substeps == 1)
@@ -97,6 +110,7 @@ class Physics(Generic[S]):
         self._qvel = self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
         self._sensordata = self.batch.bind("sensordata")
+        self._force = self.batch.bind("xfrc_applied")[:, model.body(task.pushed).id, :3]
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         return self.place(rows, self.task.start(rng, len(rows), perturbed=self.perturbed))
@@ -113,22 +127,33 @@ class Physics(Generic[S]):
         self.seconds += perf_counter() - began
         return self._read(rows, start.time, start.memory)
 
-    def advance(self, state: S, action: Array) -> S:
+    def advance(self, state: S, action: Array, rows: np.ndarray | None = None) -> S:
         control, memory = self.task.control(state, action)
-        self._ctrl[:] = control
+        at = slice(None) if rows is None else rows
+        self._ctrl[at] = control
+        self._force[at] = self.push_force(state.time, at)
         self.batch.warning[:] = 0
         began = perf_counter()
         with _one_line():
-            self.batch.step(nstep=self.task.substeps, stage=_CURRENT)
+            ids = None if rows is None else np.asarray(rows, np.int32)
+            self.batch.step(ids, nstep=self.task.substeps, stage=_CURRENT)
         self.seconds += perf_counter() - began
         self.substeps += len(control) * self.task.substeps
-        following = self._read(slice(None), state.time + self.task.timestep, memory)
-        warned = self.batch.warning[:, :, _NUMBER]
+        following = self._read(at, state.time + self.task.timestep, memory)
+        warned = self.batch.warning[at, :, _NUMBER]
         self.warnings += warned.sum(axis=0)
-        self.diverged = np.flatnonzero(warned[:, UNSTABLE].any(axis=1))
-        if len(self.diverged):
-            following = following.updated(self.diverged, state.rows(self.diverged))
+        failed = np.flatnonzero(warned[:, UNSTABLE].any(axis=1))
+        self.diverged = failed if rows is None else rows[failed]
+        if len(failed):
+            following = following.updated(failed, state.rows(failed))
         return following
+
+    def push_force(self, time: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
+        """Newtons in the world frame on the pushed body of the simulations in `rows`, over the
+        control steps that begin at `time` (n,); shape (n, 3)."""
+        if self.push is None:
+            return np.zeros((len(time), 3))
+        return self.push.rows(rows).during(time, self.task.timestep)
 
     def warned(self) -> dict[str, int]:
         """How often mujoco has warned, by mujoco's names; without those that never came."""
@@ -275,6 +300,7 @@ def expect_finite(
     action: np.ndarray,
     state: State | None = None,
     reward: np.ndarray | None = None,
+    rows: np.ndarray | None = None,
 ) -> None:
     """Looks at a step of many episodes.
 
@@ -284,6 +310,7 @@ def expect_finite(
         action: shape (n, action_size).
         state: the state after it, once it is known.
         reward: of the step, shape (n,), once it is known.
+        rows: which of the environments these are, shape (n,), where they are not all.
 
     Raises:
         NotFiniteError: a number is not finite. It names the episode, its step and the quantity.
@@ -297,7 +324,8 @@ def expect_finite(
         finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
         row = int(np.flatnonzero(~finite)[0])
         before = {f"previous_{key}": value for key, value in vars(previous).items()}
+        which = row if rows is None else rows[row]
         raise NotFiniteError(
-            f"{name} of environment {row} is not finite at step {steps[row]} of its episode",
+            f"{name} of environment {which} is not finite at step {steps[row]} of its episode",
             {"steps": steps, **before, "action": action, **looked_at},
         )

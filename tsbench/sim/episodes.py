@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Generic
 
 import numpy as np
 
@@ -21,22 +21,26 @@ class Episodes(Generic[S]):
     Attributes:
         rewards: shape (T, n); zero once an episode has ended.
         lengths: steps taken, shape (n,).
+        limits: steps that could be taken, shape (n,): T, or less where an episode began late.
         reached: whether the episode ended at its goal, unspoiled, shape (n,).
         violated: whether something spoiled it on the way, shape (n,). Its physics having diverged,
             which ends it with a reward of zero for that step, does.
         diverged: whether that happened, shape (n,).
+        cut: whether it ended for a reason other than its goal or its last step, shape (n,).
         final: the last state of each episode.
         states: what `record` made of every state, start included, shape (T + 1, n, ...), each
             episode's last one repeated after its end; None without `record`.
-        actions: shape (T, n, action_size), zero once an episode has ended.
+        actions: as they were applied, shape (T, n, action_size), zero once an episode has ended.
         max_reward: per time step.
     """
 
     rewards: np.ndarray
     lengths: np.ndarray
+    limits: np.ndarray
     reached: np.ndarray
     violated: np.ndarray
     diverged: np.ndarray
+    cut: np.ndarray
     final: S
     states: np.ndarray | None
     actions: np.ndarray
@@ -46,14 +50,19 @@ class Episodes(Generic[S]):
     def returns(self) -> np.ndarray:
         """Undiscounted, shape (n,). The steps missing from an episode that ended at its goal
         count as perfect ones, those missing from any other as nothing."""
-        credit = self.reached * (len(self.rewards) - self.lengths) * self.max_reward
+        credit = self.reached * (self.limits - self.lengths) * self.max_reward
         total: np.ndarray = self.rewards.sum(axis=0) + credit
         return total
 
     @property
     def normalized(self) -> np.ndarray:
         """Returns over the largest conceivable one, shape (n,)."""
-        return self.returns / (self.max_reward * len(self.rewards))
+        return self.returns / (self.max_reward * self.limits)
+
+    @property
+    def survived(self) -> np.ndarray:
+        """Whether it went on unspoiled to its goal or its last step, shape (n,)."""
+        return ~self.violated & ~self.cut
 
 
 def play(
@@ -61,64 +70,79 @@ def play(
     dynamics: Dynamics[S],
     policy: PolicyFunction,
     count: int,
-    seed: int,
+    seed: int = 0,
     record: Callable[[S], np.ndarray] | None = None,
-    disturb: Callable[[int], None] | None = None,
+    *,
+    begin: S | None = None,
+    delay: int = 0,
 ) -> Episodes[S]:
-    """Plays `count` episodes. `disturb` is called with the step's number before each step.
+    """Plays `count` episodes.
+
+    Args:
+        mdp: what is played.
+        dynamics: what steps it.
+        policy: sees only the episodes that have not ended.
+        count: of episodes.
+        seed: of their starts.
+        record: what to keep of all states.
+        begin: the states to go on from instead of new starts; `dynamics` must be there.
+        delay: steps between an action's observation and its use; zero actions come before it.
 
     Raises:
         NotFiniteError: a number in action, state or reward is not finite.
     """
-    rng = np.random.default_rng(seed)
-    state: Any = dynamics.begin(rng, np.arange(count))
+    rows = np.arange(count)
+    state = dynamics.begin(np.random.default_rng(seed), rows) if begin is None else begin
     final = state
-    alive = np.ones(count, bool)
-    reached, violated, diverged = (np.zeros(count, bool) for _ in range(3))
+    begun = np.rint(state.time / mdp.timestep).astype(int)
+    limits = mdp.horizon - begun
+    longest = int(limits.max())
+    reached, violated, diverged, cut = (np.zeros(count, bool) for _ in range(4))
     lengths = np.zeros(count, int)
-    rewards = np.zeros((mdp.horizon, count))
-    actions = np.zeros((mdp.horizon, count, mdp.action_size))
+    rewards = np.zeros((longest, count))
+    actions = np.zeros((longest, count, mdp.action_size))
+    pending = np.zeros((delay, count, mdp.action_size))
     recorded = [record(state)] if record else []
-    for step in range(mdp.horizon):
-        if disturb is not None:
-            disturb(step)
-        action = policy(mdp.observation(state))
-        following = dynamics.advance(state, action)
+    for step in range(longest):
+        action = np.asarray(policy(mdp.observation(state)))
+        if delay:
+            due = pending[step % delay, rows]
+            pending[step % delay, rows] = action
+            action = due
+        following = dynamics.advance(state, action, rows)
         reward = mdp.reward(state, action, following)
-        failed = np.zeros(count, bool)
-        failed[dynamics.diverged] = True
+        failed = np.isin(rows, dynamics.diverged)
         reward[failed] = 0.0
-        expect_finite(lengths + 1, state, action, following, reward)
-        rewards[step, alive] = reward[alive]
-        actions[step, alive] = action[alive]
-        lengths[alive] += 1
-        diverged |= alive & failed
-        violated |= alive & (mdp.violated(following) | failed)
-        rows = np.flatnonzero(alive)
-        final = final.updated(rows, following.rows(rows))
-        ended = alive & (mdp.terminal(following) | failed)
-        reached |= ended & mdp.reached(following) & ~violated
-        alive &= ~ended
-        state = following
+        lengths[rows] += 1
+        expect_finite(lengths[rows], state, action, following, reward, rows)
+        rewards[step, rows] = reward
+        actions[step, rows] = action
+        diverged[rows] = failed
+        violated[rows] |= mdp.violated(following) | failed
+        terminal, at_goal = mdp.terminal(following) | failed, mdp.reached(following)
+        reached[rows] = terminal & at_goal & ~violated[rows]
+        cut[rows] = terminal & ~at_goal
+        going = ~terminal & (lengths[rows] < limits[rows])
         if record:
-            playing = _like(lengths == step + 1, recorded[-1])
-            recorded.append(np.where(playing, record(state), recorded[-1]))
-        if not alive.any():
+            final = final.updated(rows, following)
+            recorded.append(record(final))
+        else:
+            final = final.updated(rows[~going], following.rows(~going))
+        state, rows = following.rows(going), rows[going]
+        if not len(rows):
             break
     if record:
-        recorded += [recorded[-1]] * (mdp.horizon + 1 - len(recorded))
+        recorded += [recorded[-1]] * (longest + 1 - len(recorded))
     return Episodes(
         rewards=rewards,
         lengths=lengths,
+        limits=limits,
         reached=reached,
         violated=violated,
         diverged=diverged,
+        cut=cut,
         final=final,
         states=np.stack(recorded) if record else None,
         actions=actions,
         max_reward=mdp.max_reward,
     )
-
-
-def _like(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return mask.reshape(-1, *[1] * (values.ndim - 1))

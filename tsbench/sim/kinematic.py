@@ -68,7 +68,7 @@ class Planning(MDP[S]):
         sampled = np.flatnonzero(rng.uniform(size=len(rows)) < self.explore)
         return start.updated(sampled, self.abstraction.sample(rng, len(sampled)))
 
-    def advance(self, state: S, action: Array) -> S:
+    def advance(self, state: S, action: Array, rows: np.ndarray | None = None) -> S:
         return self.abstraction.advance(state, action)
 
     def snapshot(self) -> dict[str, Any]:

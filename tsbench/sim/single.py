@@ -16,8 +16,10 @@ from dm_control.rl import control
 
 from tsbench.mdp import MDP, Array, Readings, State, Task
 from tsbench.sim.batched import expect_finite
+from tsbench.sim.change import Change
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
+from tsbench.sim.push import Push
 
 ROW = np.array([0])  # the batch of one that every state here is
 
@@ -76,12 +78,19 @@ class Adapter(control.Task):
 
 
 class PhysicsAdapter(Adapter):
-    """A task, or its imitation variant, in full physics."""
+    """A task, or its imitation variant, in full physics.
 
-    def __init__(self, task: Task[Any], rng: np.random.Generator, perturbed: bool) -> None:
+    Attributes:
+        push: what disturbs the episodes, or None.
+    """
+
+    def __init__(
+        self, task: Task[Any], rng: np.random.Generator, perturbed: bool, push: Push | None
+    ) -> None:
         super().__init__(task, rng)
         self.task = task
         self.perturbed = perturbed
+        self.push = push
 
     def begin(self, physics: dm_mujoco.Physics) -> None:
         start = self.task.start(self.rng, 1, perturbed=self.perturbed)
@@ -94,6 +103,11 @@ class PhysicsAdapter(Adapter):
         super().before_step(action, physics)
         ctrl, self._memory = self.task.control(self.state, self._action)
         physics.set_control(ctrl[0])
+        body = physics.model.name2id(self.task.pushed, "body")
+        physics.data.xfrc_applied[body] = 0.0
+        if self.push is not None:
+            force = self.push.during(self.state.time, self.task.timestep)
+            physics.data.xfrc_applied[body, :3] = force[0]
 
     def after_step(self, physics: dm_mujoco.Physics) -> None:
         if not physics.diverged:
@@ -186,15 +200,24 @@ class StillPhysics(dm_mujoco.Physics):
 
 
 def environment(
-    mdp: Task[Any] | Planning[Any], seed: int | None = None, *, perturbed: bool = False
+    mdp: Task[Any] | Planning[Any],
+    seed: int | None = None,
+    *,
+    perturbed: bool = False,
+    push: Push | None = None,
+    change: Change | None = None,
 ) -> control.Environment:
-    """One environment of a task or of its planning or imitation variant."""
+    """One environment of a task or of its planning or imitation variant; in full physics, with a
+    push in every episode and with other physics if they are given."""
     rng = np.random.default_rng(seed)
     if isinstance(mdp, Planning):
         physics = StillPhysics.from_model(MjModel(mdp.task.spec().compile()))
         physics.plan_timestep = mdp.timestep
         return control.Environment(physics, PlanningAdapter(mdp, rng), n_sub_steps=1)
-    physics = ExactPhysics.from_model(MjModel(mdp.spec().compile()))
+    model = mdp.spec().compile()
+    if change is not None:
+        change.apply(model)
+    physics = ExactPhysics.from_model(MjModel(model))
     return control.Environment(
-        physics, PhysicsAdapter(mdp, rng, perturbed), n_sub_steps=mdp.substeps
+        physics, PhysicsAdapter(mdp, rng, perturbed, push), n_sub_steps=mdp.substeps
     )

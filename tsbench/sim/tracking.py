@@ -35,6 +35,8 @@ class Imitation(Task[S]):
         self.horizon = self.tracking.horizon
         self.timestep = task.timestep
         self.substeps = task.substeps
+        self.pushed = task.pushed
+        self.push_plane = task.push_plane
         self.imitation_forms = task.imitation_forms
         self.observation_size = task.observation_size
         self.action_size = task.action_size
@@ -65,6 +67,13 @@ class Imitation(Task[S]):
 
     def read(self, readings: Readings) -> S:
         return self.task.read(readings)
+
+    def memory(self, state: S) -> Array:
+        return self.task.memory(state)
+
+    @property
+    def push_steps(self) -> tuple[int, ...]:
+        return self.task.push_steps
 
     def success(self, state: S) -> Array:
         return self.task.success(state)

@@ -140,6 +140,8 @@ class Laikago(Task[LaikagoState]):
     action_size: int = 12
     max_reward: float = 1.0
     imitation_forms: tuple[str, ...] = ("deepmimic",)
+    pushed = "trunk"
+    push_plane = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
     # The MDP
 
@@ -302,6 +304,17 @@ class Laikago(Task[LaikagoState]):
             com=readings.sensors["com"],
             filter=readings.memory,
         )
+
+    def memory(self, state: LaikagoState) -> Array:
+        return state.filter
+
+    @property
+    def push_steps(self) -> tuple[int, ...]:
+        """Every control step of the gait cycle that begins in the middle of the episode: the gait
+        is steady by then, and half of the episode is left to fall in."""
+        first = self.horizon // 2
+        cycle = round(self.gait.period / self.timestep)
+        return tuple(range(first, min(first + cycle, self.horizon)))
 
     def ideal(self) -> LaikagoState:
         """At top speed straight to the goal; feet at rest in stance, at even speed in swing."""

@@ -41,6 +41,7 @@ DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
 MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
 HORIZON_RATIO = 1.5  # horizon over the planner's flight time: arrive, then hover (C)
 SUCCESS_DISTANCE, SUCCESS_SPEED = 1.0, 1.0  # m, m/s (D)
+PUSHES = 16  # instants of the flight at which pushes are tried (D)
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,8 @@ class Rocket(Task[RocketState]):
     action_size: int = 2
     max_reward: float = GOAL_WEIGHT
     imitation_forms: tuple[str, ...] = ("progress", "paper")
+    pushed = "rocket"
+    push_plane = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 
     @property
     def goal(self) -> np.ndarray:
@@ -221,6 +224,13 @@ class Rocket(Task[RocketState]):
             angular_velocity=readings.qvel[..., 2],
             clearance=xp.concat([readings.qpos[..., :0], *distances], axis=-1),
         )
+
+    @property
+    def push_steps(self) -> tuple[int, ...]:
+        """Spread evenly over the planner's flight: there is no cycle whose phases could matter,
+        but there are a take-off, obstacles and an arrival."""
+        flight = self.horizon / HORIZON_RATIO
+        return tuple(int((index + 0.5) * flight / PUSHES) for index in range(PUSHES))
 
     def ideal(self) -> RocketState:
         """At the planner's speed along each axis until there."""

@@ -1,0 +1,325 @@
+"""The evaluator as an instrument: pushes that arrive, floats that agree, failures that count."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tsbench import tasks
+from tsbench.evaluation.evaluate import evaluate, perturbed_starts
+from tsbench.evaluation.protocol import SMOKE, V1, Condition, Protocol
+from tsbench.evaluation.robustness import (
+    impulse_50,
+    mass_scale,
+    robustness,
+    survival,
+    wilson,
+)
+from tsbench.mdp import State, Task
+from tsbench.sim.batched import Physics
+from tsbench.sim.change import Change
+from tsbench.sim.episodes import Episodes, PolicyFunction, play
+from tsbench.sim.push import Push
+from tsbench.sim.single import environment
+
+NONE = Condition("as it is")
+
+
+@dataclass(frozen=True)
+class Serial:
+    """One episode in the dm_control environment.
+
+    Attributes:
+        rewards: of its steps.
+        final: its last state.
+        survived: by the protocol's words.
+    """
+
+    rewards: list[float]
+    final: State
+    survived: bool
+
+
+def serial(
+    task: Task[Any],
+    policy: PolicyFunction,
+    push: Push | None = None,
+    condition: Condition = NONE,
+    seed: tuple[int, int] | None = None,
+) -> Serial:
+    env = environment(
+        task,
+        cast(Any, seed),
+        perturbed=seed is not None,
+        push=push,
+        change=condition.change,
+    )
+    adapter = cast(Any, env.task)
+    time_step = env.reset()
+    pending = [np.zeros(task.action_size)] * condition.delay
+    rewards: list[float] = []
+    violated = False
+    while not time_step.last():
+        (observation,) = time_step.observation.values()
+        pending.append(policy(observation[None])[0])
+        time_step = env.step(pending.pop(0))
+        rewards.append(float(time_step.reward))
+        violated |= bool(task.violated(adapter.state)[0])
+    ended_well = time_step.discount == 1.0 or bool(task.reached(adapter.state)[0])
+    return Serial(rewards, adapter.state, ended_well and not violated)
+
+
+def batched(
+    task: Task[Any], policy: PolicyFunction, push: Push | None = None, condition: Condition = NONE
+) -> Episodes[Any]:
+    physics: Physics[Any] = Physics(task, 1, threads=1, push=push, change=condition.change)
+    return play(task, physics, policy, 1, delay=condition.delay)
+
+
+def equal(episodes: Episodes[Any], row: int, alone: Serial) -> bool:
+    """To the last bit."""
+    length = len(alone.rewards)
+    assert episodes.lengths[row] == length
+    assert episodes.rewards[:length, row].tolist() == alone.rewards
+    assert episodes.survived[row] == alone.survived
+    final = episodes.final.rows(slice(row, row + 1))
+    pairs = [(getattr(final, f.name), getattr(alone.final, f.name)) for f in fields(final)]
+    return all(a.tobytes() == b.tobytes() for a, b in pairs)
+
+
+def swaying(task: Task[Any]) -> PolicyFunction:
+    """Answers everything that it sees, so that a difference anywhere would spread."""
+    weights = 0.05 * np.random.default_rng(0).normal(size=(task.observation_size, task.action_size))
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        # Summed by hand: a matrix product of several rows rounds differently from one of one.
+        action: np.ndarray = np.tanh((observation[:, :, None] * weights).sum(axis=1))
+        return action if task.action_size > 2 else np.abs(action) * [1.0, 0.0] + [0.4, 0.0]
+
+    return policy
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_serial_equals_batched(name: str) -> None:
+    """A whole nominal, a perturbed, a pushed and a changed episode of every task."""
+    task = tasks.make(name)
+    policy = swaying(task)
+    assert equal(batched(task, policy), 0, serial(task, policy))
+
+    protocol = replace(SMOKE, perturbed=3)
+    starts = perturbed_starts(task, protocol)
+    physics: Physics[Any] = Physics(task, 3, threads=2)
+    episodes = play(task, physics, policy, 3, begin=physics.place(np.arange(3), starts))
+    for episode in range(3):
+        assert equal(episodes, episode, serial(task, policy, seed=(protocol.seed, episode)))
+
+    across, along = np.array(task.push_plane)
+    push = Push(0.3, 0.1, 150.0 * mass_scale(task) * (across + along) / math.sqrt(2))
+    pushed = batched(task, policy, push)
+    assert equal(pushed, 0, serial(task, policy, push))
+    assert pushed.final.time != batched(task, policy).final.time or not np.array_equal(
+        task.observation(pushed.final), task.observation(batched(task, policy).final)
+    )
+
+    for condition in (
+        Condition("all at once", Change(mass=1.2, friction=0.5, strength=0.8)),
+        Condition("late", delay=2),
+    ):
+        changed = batched(task, policy, condition=condition)
+        assert equal(changed, 0, serial(task, policy, condition=condition))
+        assert changed.rewards.tolist() != batched(task, policy).rewards.tolist()
+
+
+SMALL = Protocol(
+    name="small", ranked=False, seed=0, perturbed=1, changed=1, conditions=(),
+    headings=3, phases=6, forces=(100.0, 500.0),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["laikago_trot", "rocket_navigation"])
+def test_a_push_played_from_its_moment_is_the_whole_episode(name: str) -> None:
+    """What is gone on from shortly before the push is what the dm_control environment plays from
+    the start, with no reset on the way."""
+    task = tasks.make(name)
+    still = np.zeros(task.action_size)
+    if name == "rocket_navigation":
+        still[0] = 0.5  # climbs out of the world, unless a push helps it to stay
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        return np.tile(still, (len(observation), 1))
+
+    forces = np.array(SMALL.forces) * mass_scale(task)
+    phases = task.push_steps[:: SMALL.phases]
+    assert len(phases) >= 3
+    survived, unpushed = survival(policy, task, forces, phases, SMALL, threads=1)
+    assert survived.shape == (2, 3, len(phases))
+    assert unpushed == serial(task, policy).survived
+    across, along = np.array(task.push_plane)
+    for f, force in enumerate(forces):
+        for p, phase in list(enumerate(phases))[:2]:
+            for h, heading in enumerate(SMALL.directions()):
+                direction = math.cos(heading) * across + math.sin(heading) * along
+                push = Push(phase * task.timestep, 0.1, force * direction)
+                assert serial(task, policy, push).survived == survived[f, h, p], (f, h, p)
+
+
+def test_a_standing_robot_survives_small_pushes_and_no_large_ones() -> None:
+    """A policy of known worth: 10 N s move it by at most 0.39 m/s, 100 N s throw it."""
+    task = tasks.make("laikago_walk")
+    protocol = replace(SMALL, forces=(50.0, 1000.0), claim=50.0)
+    found = robustness(lambda o: np.zeros((len(o), 12)), task, protocol, threads=1)
+    assert found.survival_100N == 1.0  # the share at the claim
+    assert found.surface.forces_N == (50.0, 1000.0)
+    assert found.surface.phases == (90, 96, 102, 108)
+    assert np.array(found.surface.survived)[1].sum() == 0
+    assert found.impulse_50 == pytest.approx(5.0 + (100.0 - 5.0) / 2)  # half way from all to none
+    assert not found.impulse_50_is_lower_bound
+
+
+def test_an_episode_that_is_over_before_its_push_does_not_survive() -> None:
+    """A rocket that falls leaves the world after 2.9 s; its pushes are spread over 10.4 s."""
+    task = tasks.make("rocket_navigation")
+    found = robustness(lambda o: np.zeros((len(o), 2)), task, SMALL, threads=1)
+    assert not np.any(found.surface.survived)
+    assert (found.survival_100N, found.impulse_50) == (0.0, 0.0)
+    assert found.survival_100N_interval[0] == 0.0
+    assert len(found.surface.phases) == 3  # all of them are in the denominator
+    low, high = wilson(0, 3 * 3)
+    assert found.survival_100N_interval == (low, high)
+
+
+def test_the_rocket_is_pushed_as_fast() -> None:
+    """5 kg of 25.433: 19.66 N, which change its velocity as 100 N change Laikago's."""
+    assert mass_scale(tasks.make("laikago_walk")) == mass_scale(tasks.make("laikago_trot")) == 1.0
+    scale = mass_scale(tasks.make("rocket_obstacles"))
+    assert scale == pytest.approx(5.0 / 25.433, rel=1e-5)
+    assert 100.0 * scale * 0.1 / 5.0 == pytest.approx(10.0 / 25.433, rel=1e-5)
+
+
+# Summaries
+
+
+@pytest.mark.parametrize(
+    ("survived", "expected", "is_bound"),
+    [
+        ([1.0, 0.75, 0.25, 0.0], 25.0, False),  # half way from 20 to 30
+        ([1.0, 1.0, 0.0, 0.0], 25.0, False),
+        ([1.0, 0.5, 0.4, 0.0], 20.0, False),  # exactly half at 20
+        ([1.0, 1.0, 1.0, 0.6], 40.0, True),  # never below half: no more than a bound
+        ([1.0, 1.0, 1.0, 0.5], 40.0, False),
+        ([0.25, 0.0, 0.0, 0.0], 20.0 / 3.0, False),  # from all at zero: 1 - 0.075 J = 0.5
+        ([0.9, 0.3, 0.6, 0.0], 10.0 + 10.0 * 0.4 / 0.45, False),  # 0.3 and 0.6 pooled to 0.45
+    ],
+)
+def test_impulse_50_by_hand(survived: list[float], expected: float, is_bound: bool) -> None:
+    impulses = np.array([10.0, 20.0, 30.0, 40.0])
+    found, bound = impulse_50(impulses, np.array(survived))
+    assert found == pytest.approx(expected)
+    assert bound == is_bound
+
+
+def test_impulse_50_of_what_falls_by_itself() -> None:
+    assert impulse_50(np.array([10.0]), np.array([0.0]), unpushed=False) == (0.0, False)
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))
+def test_impulse_50_rises_with_survival(survived: list[float]) -> None:
+    impulses = np.arange(1.0, len(survived) + 1)
+    lower = impulse_50(impulses, np.array(survived))[0]
+    better = impulse_50(impulses, np.minimum(np.array(survived) + 0.1, 1.0))[0]
+    assert 0.0 <= lower <= better + 1e-9 <= impulses[-1] + 1e-9
+
+
+def test_wilson_by_hand() -> None:
+    """z = 1.96. All of 256: 256 / (256 + z^2). Half of 100: 0.5 +- 1.96 sqrt(0.25 / 103.84) ..."""
+    z = 1.959963984540054
+    assert wilson(256, 256) == pytest.approx((256 / (256 + z * z), 1.0))
+    half = z / (100 + z * z) * math.sqrt(100 * 0.25 + z * z / 4)
+    assert wilson(50, 100) == pytest.approx((0.5 - half, 0.5 + half))
+
+
+# The protocol
+
+
+def test_v1_is_frozen() -> None:
+    """Whoever changes one of these makes a new protocol with a new name."""
+    assert (V1.name, V1.ranked, V1.seed, V1.perturbed, V1.changed) == ("v1", True, 0, 100, 20)
+    assert (V1.headings, V1.phases, V1.claim, V1.duration) == (16, 1, 100.0, 0.1)
+    assert V1.forces == tuple(range(50, 601, 50))
+    levels = {c.name: (c.change.mass, c.change.friction, c.change.strength, c.delay)
+              for c in V1.conditions}  # fmt: skip
+    assert levels == {
+        "mass x 0.8": (0.8, 1.0, 1.0, 0),
+        "mass x 1.2": (1.2, 1.0, 1.0, 0),
+        "friction x 0.5": (1.0, 0.5, 1.0, 0),
+        "friction x 1.25": (1.0, 1.25, 1.0, 0),
+        "motor strength x 0.8": (1.0, 1.0, 0.8, 0),
+        "motor strength x 1.2": (1.0, 1.0, 1.2, 0),
+        "latency 1 control step": (1.0, 1.0, 1.0, 1),
+        "latency 2 control steps": (1.0, 1.0, 1.0, 2),
+    }
+
+
+def test_phases_are_one_gait_cycle() -> None:
+    assert tasks.make("laikago_trot").push_steps == tuple(range(90, 106))
+    assert tasks.make("laikago_walk").push_steps == tuple(range(90, 114))
+    rocket = tasks.make("rocket_obstacles").push_steps
+    assert len(rocket) == 16
+    assert rocket[0] == 16
+    assert rocket[-1] == 503  # the planner's flight takes 519 steps
+    assert tasks.make("laikago_trot", distance=0.1).push_steps == (2, 3, 4)
+
+
+def test_common_random_numbers() -> None:
+    """Every policy meets the same starts, and a start does not depend on how many there are."""
+    task = tasks.make("laikago_walk")
+    many, few = (perturbed_starts(task, replace(SMOKE, perturbed=count)) for count in (5, 3))
+    np.testing.assert_array_equal(many.qpos[:3], few.qpos)
+    np.testing.assert_array_equal(many.qvel[:3], few.qvel)
+    assert len(np.unique(many.qpos, axis=0)) == 5
+
+
+def test_changes_do_what_they_say() -> None:
+    """The same thrust on other masses; half of the strength is half of the thrust."""
+    task = tasks.make("rocket_navigation")
+
+    def climb(change: Change) -> float:
+        physics: Physics[Any] = Physics(task, 1, threads=1, change=change)
+        state = physics.begin(np.random.default_rng(0), np.arange(1))
+        state = physics.advance(state, np.array([[1.0, 0.0]]))
+        return float(state.velocity[0, 1])
+
+    def expected(mass: float, thrust: float) -> float:
+        return 0.02 * (thrust - 2.5 * mass) / (mass + 0.02 * 2.5)
+
+    assert climb(Change()) == pytest.approx(expected(5.0, 50.0))
+    assert climb(Change(mass=1.2)) == pytest.approx(expected(6.0, 50.0))
+    assert climb(Change(strength=0.5)) == pytest.approx(expected(5.0, 25.0))
+    model = tasks.make("laikago_walk").spec().compile()
+    before = model.geom_friction.copy(), model.actuator_forcerange.copy()
+    Change(friction=0.5, strength=0.8).apply(model)
+    np.testing.assert_array_equal(model.geom_friction, 0.5 * before[0])
+    np.testing.assert_array_equal(model.actuator_forcerange, 0.8 * before[1])
+    assert model.body_subtreemass[0] == pytest.approx(25.433)
+
+
+def test_an_early_end_counts_its_missing_steps() -> None:
+    """A fall after n of 180 steps leaves 180 - n zeros in the mean."""
+    task = tasks.make("laikago_trot")
+
+    def crouch(observation: np.ndarray) -> np.ndarray:
+        return np.tile([0.0, 1.0, -1.0], (len(observation), 4))
+
+    score = evaluate(crouch, task, protocol=replace(SMOKE, perturbed=2, conditions=()), threads=1)
+    alone = serial(task, crouch)
+    assert len(alone.rewards) < 180
+    assert score.nominal.steps == len(alone.rewards)
+    assert score.nominal.violations == 1.0
+    assert score.normalized_reward == pytest.approx(sum(alone.rewards) / 180, rel=1e-12)
+    assert score.robustness.survival_100N == 0.0

@@ -1,0 +1,124 @@
+"""Random worlds to train in: what they do, and that they repeat."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tsbench import tasks
+from tsbench.mdp import State
+from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
+
+NAMES = ("laikago_trot", "rocket_navigation")
+
+
+def same(first: State, second: State) -> bool:
+    """Whether two states are equal to the last bit."""
+    pairs = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(first)]
+    return all(a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
+
+
+def states(
+    name: str, disturbances: Disturbances, *, seed: int = 0, threads: int = 1, steps: int = 60
+) -> list[Any]:
+    """What four environments go through under random actions."""
+    task = tasks.make(name)
+    physics: Physics[Any] = DisturbedPhysics(task, 4, disturbances, seed, threads=threads)
+    batch = BatchedEnvironment(task, physics, 4, seed)
+    rng = np.random.default_rng(1)
+    batch.reset()
+    found = []
+    for _ in range(steps):
+        batch.step(rng.normal(0.0, 0.1, (4, task.action_size)))
+        found.append(batch.state)
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_disturbance_changes_nothing(name: str) -> None:
+    task = tasks.make(name)
+    batch = BatchedEnvironment(task, Physics(task, 4, threads=1), 4, 0)
+    rng = np.random.default_rng(1)
+    batch.reset()
+    for state in states(name, Disturbances()):
+        batch.step(rng.normal(0.0, 0.1, (4, task.action_size)))
+        assert same(state, batch.state)
+
+
+EVERYTHING = Disturbances(push=200.0, interval=0.5, mass=0.2, friction=0.5, strength=0.1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_seed_is_everything(name: str) -> None:
+    """The same world at any number of threads, another one with another seed."""
+    first = states(name, EVERYTHING)
+    again = states(name, EVERYTHING, threads=2)
+    assert all(same(*pair) for pair in zip(first, again, strict=True))
+    other = states(name, EVERYTHING, seed=1)
+    assert not same(first[-1], other[-1])
+
+
+def test_pushes_come_once_an_interval() -> None:
+    """Idle rockets: each is pushed for 0.1 s in every 0.5 s, from a time of its own on, every time
+    another way; the first by nothing, the last by at most 20 N."""
+    task = tasks.make("rocket_navigation")
+    count, steps = 40, 125  # 2.5 s
+    disturbances = Disturbances(push=20.0, interval=0.5)
+    physics = DisturbedPhysics(task, count, disturbances, 0, threads=1)
+    state = physics.begin(np.random.default_rng(0), np.arange(count))
+    forces = np.zeros((steps, count, 3))
+    for step in range(steps):
+        forces[step] = physics.push_force(state.time, slice(None))
+        state = physics.advance(state, np.zeros((count, 2)))
+    assert not np.any(forces[..., 1])  # the rocket's plane
+    size = np.linalg.norm(forces, axis=-1)
+    assert np.all(size.max(axis=0) <= np.linspace(0.0, 20.0, count))
+    assert size.max() > 15.0
+    assert not np.any(size[:, 0])
+    size, forces = size[:, 1:], forces[:, 1:]
+    pushed = size > 0.0
+    firsts = pushed.argmax(axis=0)
+    assert set(firsts) <= set(range(26))
+    assert len(set(firsts)) > 10
+    # Each covers 0.1 s: four whole steps and parts of two, or five whole ones.
+    assert np.all((pushed.sum(axis=0) >= 4 * 4) & (pushed.sum(axis=0) <= 5 * 6))
+    impulses = forces.sum(axis=0) * task.timestep
+    assert np.linalg.norm(impulses, axis=-1).max() <= 5 * 2.0
+    headings = np.arctan2(forces[..., 2], forces[..., 0])[pushed]
+    counts, _ = np.histogram(headings, bins=4, range=(-np.pi, np.pi))
+    assert counts.min() > 0.15 * len(headings)
+    assert np.abs(state.velocity[:, 0]).max() > 0.1
+    assert abs(state.velocity[0, 0]) < 1e-12
+
+
+def test_every_environment_has_its_own_physics_for_good() -> None:
+    task = tasks.make("rocket_navigation")
+    physics = DisturbedPhysics(task, 8, Disturbances(mass=0.3), 5, threads=1)
+    gained = []
+    for _ in range(2):
+        state = physics.begin(np.random.default_rng(0), np.arange(8))
+        state = physics.advance(state, np.tile([1.0, 0.0], (8, 1)))
+        gained.append(state.velocity[:, 1])
+    np.testing.assert_array_equal(gained[0], gained[1])
+    # v = h (F - g m) / (m + h d), so m = h F + ... solved for the mass
+    mass = (0.02 * 50.0 - gained[0] * 0.02 * 2.5) / (gained[0] + 0.02 * 2.5)
+    assert len(np.unique(mass)) == 8
+    assert np.all((mass > 0.7 * 5.0) & (mass < 1.3 * 5.0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"push": -1.0}, "disturb.push must not be negative"),
+        ({"duration": 2.0}, "at most disturb.interval"),
+        ({"mass": 1.0}, r"disturb.mass must lie in \[0, 1\)"),
+        ({"friction": -0.1}, r"disturb.friction must lie in \[0, 1\)"),
+    ],
+)
+def test_values_that_make_no_sense(wrong: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Disturbances(**wrong)

@@ -1,0 +1,83 @@
+"""Scores to hold others against: doing nothing, doing anything, and the best motion known.
+
+`references.json` keeps them. `python -m tsbench.evaluation.references` makes it again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tsbench import tasks
+from tsbench.adapters import ForeignPolicy, from_function
+from tsbench.evaluation.evaluate import Score, best_return, evaluate
+from tsbench.evaluation.protocol import V1
+from tsbench.mdp import MDP, Task
+
+FILE = Path(__file__).with_name("references.json")
+
+
+def zero(mdp: MDP[Any]) -> ForeignPolicy:
+    """Every action is zero: the nominal pose, or no thrust."""
+    return from_function(lambda _: np.zeros(mdp.action_size), mdp)
+
+
+def random(mdp: MDP[Any]) -> ForeignPolicy:
+    """Uniform actions. Each is drawn from a generator that its observation seeds, so that the
+    policy is a function, and repeats."""
+
+    def answer(observation: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(zlib.crc32(observation.tobytes()))
+        return rng.uniform(-1.0, 1.0, mdp.action_size)
+
+    return from_function(answer, mdp)
+
+
+POLICIES: dict[str, Callable[[MDP[Any]], ForeignPolicy]] = {"random": random, "zero": zero}
+
+
+def rows(task: Task[Any]) -> dict[str, Any]:
+    """The oracle's return and row, and those of the reference policies by protocol v1."""
+    best = best_return(task)
+    oracle = {
+        "normalized_reward": best / (task.max_reward * task.horizon),
+        "optimality": 1.0,
+        "success": 1.0,
+    }
+    policies = {name: row(evaluate(make(task), task)) for name, make in sorted(POLICIES.items())}
+    return {
+        "task_version": task.version,
+        "protocol": V1.name,
+        "best_return": best,
+        "rows": {"oracle": oracle, **policies},
+    }
+
+
+def row(score: Score) -> dict[str, Any]:
+    """The figures of a score that a reader compares with."""
+    return {
+        "normalized_reward": score.normalized_reward,
+        "optimality": score.optimality,
+        "success": score.success,
+        "perturbed_success": score.perturbed.success,
+        "survival_100N": score.robustness.survival_100N,
+        "impulse_50": score.robustness.impulse_50,
+    }
+
+
+def stored(task: str) -> dict[str, Any]:
+    """What `rows` gave for a task, from the file."""
+    content: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))[task]
+    return content
+
+
+if __name__ == "__main__":
+    made = {name: rows(tasks.make(name)) for name in tasks.names()}
+    FILE.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")
+    sys.stdout.write(f"{FILE}\n")

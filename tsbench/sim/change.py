@@ -1,0 +1,33 @@
+"""Changes to the physics: what a policy meets when the world is not quite its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+
+
+@dataclass(frozen=True)
+class Change:
+    """Factors on the physics of a task.
+
+    Attributes:
+        mass: of every body, its inertia with it.
+        friction: of every contact.
+        strength: of every motor: the force or torque that it gives, and the most that it can.
+    """
+
+    mass: float = 1.0
+    friction: float = 1.0
+    strength: float = 1.0
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        """Changes a compiled model in place."""
+        model.body_mass *= self.mass
+        model.body_inertia *= self.mass
+        model.geom_friction *= self.friction
+        model.actuator_gainprm *= self.strength
+        model.actuator_biasprm *= self.strength
+        model.actuator_forcerange *= self.strength
+        # What the compiler derived from masses: weights of subtrees, inertias at rest.
+        mujoco.mj_setConst(model, mujoco.MjData(model))

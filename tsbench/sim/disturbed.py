@@ -1,0 +1,112 @@
+"""A world that is not quite the task's own, to train in: random pushes and random physics."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tsbench.mdp import Rng, S, Task
+from tsbench.sim.batched import Physics
+from tsbench.sim.change import Change
+from tsbench.sim.push import Push
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """What is random, all of it uniform; zeros disturb nothing.
+
+    Attributes:
+        push: newtons at most, on the body that the task lets be pushed, at any heading. That is in
+            the last environment; the bound falls evenly to none in the first, so that there is
+            always something to learn from.
+        interval: seconds from push to push. The first comes at random within one.
+        duration: of a push in seconds.
+        mass: largest change of all masses, as a share, up or down; of each environment its own.
+        friction: the same for friction.
+        strength: the same for the strength of the motors.
+    """
+
+    push: float = 0.0
+    interval: float = 1.0
+    duration: float = 0.1
+    mass: float = 0.0
+    friction: float = 0.0
+    strength: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.push < math.inf:
+            raise ValueError(f"disturb.push must not be negative, not {self.push}")
+        if not 0.0 < self.duration <= self.interval < math.inf:
+            raise ValueError("disturb.duration must be positive and at most disturb.interval")
+        for name in ("mass", "friction", "strength"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"disturb.{name} must lie in [0, 1), not {getattr(self, name)}")
+
+
+class DisturbedPhysics(Physics[S]):
+    """Full physics under disturbances.
+
+    Every environment keeps its own physics for good, drawn from `seed`. An episode's pushes are
+    drawn when it begins, so that they depend on nothing that happens in it.
+    """
+
+    def __init__(
+        self,
+        task: Task[S],
+        count: int,
+        disturbances: Disturbances,
+        seed: int,
+        *,
+        threads: int | None = None,
+    ) -> None:
+        super().__init__(task, count, threads=threads)
+        self.disturbances = disturbances
+        pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
+        self._first = np.zeros(count)  # seconds into the episode
+        self._forces = np.zeros((count, pushes, 3))
+        self._strongest = np.linspace(0.0, disturbances.push, count)
+        self._axes = np.array(task.push_plane)
+        rng = np.random.default_rng(seed)
+        bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
+        if any(bounds):
+            factors = 1.0 + rng.uniform(-1.0, 1.0, (count, 3)) * bounds
+            self._models = [copy.copy(self.batch.model) for _ in range(count)]
+            for model, (mass, friction, strength) in zip(self._models, factors, strict=True):
+                Change(mass, friction, strength).apply(model)
+            self.batch.set_models(self._models)
+
+    def begin(self, rng: Rng, rows: np.ndarray) -> S:
+        if self.disturbances.push:
+            self._draw(rng, rows)
+        return super().begin(rng, rows)
+
+    def _draw(self, rng: Rng, rows: np.ndarray) -> None:
+        shape = (len(rows), self._forces.shape[1])
+        heading = rng.uniform(0.0, 2.0 * math.pi, shape)
+        size = rng.uniform(0.0, 1.0, shape) * self._strongest[rows, None]
+        direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1) @ self._axes
+        self._forces[rows] = size[..., None] * direction
+        self._first[rows] = rng.uniform(0.0, self.disturbances.interval, len(rows))
+
+    def snapshot(self) -> dict[str, Any]:
+        return {**super().snapshot(), "first": self._first, "forces": self._forces}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        super().restore(snapshot)
+        self._first, self._forces = snapshot["first"], snapshot["forces"]
+
+    def push_force(self, time: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
+        """Of the push that is the latest by the end of the step."""
+        first, interval = self._first[rows], self.disturbances.interval
+        number = np.floor((time + self.task.timestep - first) / interval).astype(int)
+        number = np.clip(number, 0, self._forces.shape[1] - 1)
+        force = self._forces[rows][np.arange(len(number)), number]
+        push = Push(
+            first + number * interval, np.full_like(first, self.disturbances.duration), force
+        )
+        return push.during(time, self.task.timestep)
