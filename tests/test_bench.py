@@ -26,7 +26,6 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(bench, name, TINY)
     monkeypatch.setattr(stepping, "RECORDED", 3)
     monkeypatch.setattr(sb3, "PATIENCE", 0.0)
-    monkeypatch.setattr(sb3, "PROCESSES", 2)
 
 
 @pytest.mark.parametrize("name", bench.names())

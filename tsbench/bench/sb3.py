@@ -3,12 +3,11 @@
 Ours trains in two stages with budget=fast, to its end. Stable-Baselines3 then learns to imitate
 the same reference motion, until its deterministic policy scores as much from the task's own start;
 that it stops there, and that its plan is a gift, are in its favour. Its settings are ours wherever
-it has them: networks, steps between updates, epochs, minibatches, discounts, clipping, entropy,
-spread; observations are normalised by its VecNormalize. Where ours adapts the learning rate to a KL
-divergence, it keeps its default of 3e-4. Its environments are those of `tsbench.sim.gym`: for the
-rocket, whose steps are cheaper than a message, as many as ours in one process; for Laikago sixteen,
-each in a process of its own, with longer rollouts. Torch has one thread in both. Judging policies
-is not timed.
+it has them: networks, environments, steps between updates, epochs, minibatches, discounts,
+clipping, entropy, spread; observations are normalised by its VecNormalize. Where ours adapts the
+learning rate to a KL divergence, it keeps its default of 3e-4. Its environments are those of
+`tsbench.sim.gym` in one process, its default: on two cores a loop was faster than processes (the
+`loop` and `async` figures). Torch has one thread in both. Judging policies is not timed.
 """
 
 from __future__ import annotations
@@ -46,17 +45,16 @@ from tsbench.workspace import RunWorkspace
 LEARNING_RATE = 3e-4  # Stable-Baselines3's own
 PATIENCE = 10.0  # times our time, after which it has failed
 CHECKS = 40  # of its policy while it uses our number of steps
-PROCESSES = 16  # at most, where it pays to have any
 
 
 @comparison("sb3", requires=("stable_baselines3",), named=True)
 def rocket(effort: Effort) -> Findings:
-    return compare("rocket_navigation", effort, processes=False)
+    return compare("rocket_navigation", effort)
 
 
 @comparison("sb3_laikago", requires=("stable_baselines3",), named=True)
 def laikago(effort: Effort) -> Findings:
-    return compare("laikago_trot", effort, processes=True)
+    return compare("laikago_trot", effort)
 
 
 @dataclass(frozen=True)
@@ -82,13 +80,13 @@ class Outcome:
         )
 
 
-def compare(name: str, effort: Effort, *, processes: bool) -> Findings:
+def compare(name: str, effort: Effort) -> Findings:
     problem = prepare(compose([f"task={name}", f"budget={effort.budget}"]))
     with tempfile.TemporaryDirectory() as folder:
         ours = train(problem, Path(folder))
         reference = ReferenceMotion.load(Path(folder) / REFERENCE)
     imitation = Imitation(problem.task, reference)
-    theirs = Rival(imitation, settings(problem, "imitate"), problem.seed, processes)
+    theirs = Rival(imitation, settings(problem, "imitate"), problem.seed)
     outcome = theirs.learn(ours, judge(problem.task))
     arrived = "" if outcome.score >= ours.score else " (at least: it did not get there)"
     ratio = outcome.seconds / ours.seconds
@@ -135,23 +133,17 @@ def train(problem: Problem, folder: Path) -> Outcome:
 class Rival:
     """Stable-Baselines3's PPO in an imitation variant."""
 
-    def __init__(
-        self, imitation: Imitation[Any], chosen: PPOSettings, seed: int, processes: bool
-    ) -> None:
+    def __init__(self, imitation: Imitation[Any], chosen: PPOSettings, seed: int) -> None:
         # The package is an extra: it is looked for when it is needed.
         vectors: Any = importlib.import_module("stable_baselines3.common.vec_env")
-        count = min(chosen.environments, PROCESSES) if processes else chosen.environments
-        rollout = chosen.environments * chosen.rollout // count
-        kind = vectors.SubprocVecEnv if processes else vectors.DummyVecEnv
-        self._vector = vectors.VecNormalize(
-            kind([lambda: GymEnvironment(environment(imitation))] * count), norm_reward=False
-        )
+        environments = [lambda: GymEnvironment(environment(imitation))] * chosen.environments
+        self._vector = vectors.VecNormalize(vectors.DummyVecEnv(environments), norm_reward=False)
         self._ppo = importlib.import_module("stable_baselines3").PPO(
             "MlpPolicy",
             self._vector,
             learning_rate=LEARNING_RATE,
-            n_steps=rollout,
-            batch_size=count * rollout // chosen.minibatches,
+            n_steps=chosen.rollout,
+            batch_size=chosen.environments * chosen.rollout // chosen.minibatches,
             n_epochs=chosen.epochs,
             gamma=chosen.discount,
             gae_lambda=chosen.gae_lambda,

@@ -34,7 +34,7 @@ from tsbench.sim.single import environment
 NOISE = 0.2  # standard deviation of actions: robots move, and stand for a while
 RECORDED = 40  # control steps that the bare rollout repeats
 SINGLE_STEPS = 8  # of a single environment at a time
-PROCESSES = 4  # of AsyncVectorEnv for each core; measured best among 1, 4 and 16
+PROCESSES = 4  # of AsyncVectorEnv for each core: one that is late leaves none idle
 
 RATIOS = (
     ("batched", "rollout"),
