@@ -10,13 +10,12 @@ from functools import cache
 # by side, and threads that wait for each other's cores slow a small network down tenfold.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
 from tsbench import tasks
 from tsbench.motion import Plan, ReferenceMotion
-from tsbench.sim.kinematic import Planning
+from tsbench.sim.kinematic import naive_plan
 
 # How fast a machine is, or how busy, is no property of the code.
 settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -25,19 +24,7 @@ settings.load_profile("any")
 
 @cache
 def _naive_plan(name: str) -> Plan:
-    task = tasks.make(name)
-    planning = Planning(task)
-    abstraction = planning.abstraction
-    state = abstraction.start(1)
-    states = [abstraction.flatten(state)[0]]
-    rewards: list[float] = []
-    while len(rewards) < planning.horizon and not planning.terminal(state)[0]:
-        action = abstraction.naive(state)
-        following = planning.advance(state, action)
-        rewards.append(planning.reward(state, action, following)[0])
-        states.append(abstraction.flatten(following)[0])
-        state = following
-    return Plan(name, task.version, planning.timestep, np.array(states), np.array(rewards))
+    return naive_plan(tasks.make(name))
 
 
 @cache
@@ -45,8 +32,8 @@ def _naive_reference(name: str) -> ReferenceMotion:
     return tasks.make(name).reference(_naive_plan(name))
 
 
-@pytest.fixture(scope="session")
-def naive_plan() -> Callable[[str], Plan]:
+@pytest.fixture(name="naive_plan", scope="session")
+def naive_plan_fixture() -> Callable[[str], Plan]:
     """Of a task: the plan that its hand-made planner makes."""
     return _naive_plan
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tsbench.mdp import MDP, Array, Rng, S, Task
+from tsbench.motion import Plan
 
 
 class Planning(MDP[S]):
@@ -73,3 +74,19 @@ class Planning(MDP[S]):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         self.explore = snapshot["explore"]
+
+
+def naive_plan(task: Task[S]) -> Plan:
+    """The plan that a task's hand-made planner makes, without learning."""
+    planning = Planning(task)
+    abstraction = planning.abstraction
+    state = abstraction.start(1)
+    states = [abstraction.flatten(state)[0]]
+    rewards: list[float] = []
+    while len(rewards) < planning.horizon and not planning.terminal(state)[0]:
+        action = abstraction.naive(state)
+        following = planning.advance(state, action)
+        rewards.append(float(planning.reward(state, action, following)[0]))
+        states.append(abstraction.flatten(following)[0])
+        state = following
+    return Plan(task.name, task.version, planning.timestep, np.array(states), np.array(rewards))
