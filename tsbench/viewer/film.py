@@ -144,10 +144,11 @@ class Camera:
         pen.text((16, 12), self.show.title, TEXT, _font(18))
         for index, actor in enumerate(everybody):
             pen.text((16, 40 + 24 * index), actor.name, _bytes(actor.colour), _font(16))
-        pen.text((width - 16, height - 16), f"{time:.2f} s", TEXT, _font(18), anchor="rs")
+        pen.text((16, height - 16), f"{time:.2f} s", TEXT, _font(18), anchor="ls")
         if self.view.size / (distance * math.tan(math.radians(FIELD_OF_VIEW / 2))) < SMALL:
             inset = self._close(self._small, everybody, everybody[0], time)
-            left, top = width - INSET - 12, 12
+            # Ground goes on at the top, where a flight's goal is.
+            left, top = width - INSET - 12, height - INSET - 12 if self.view.flat else 12
             picture.paste(Image.fromarray(inset), (left, top))
             pen.rectangle((left, top, left + INSET, top + INSET), outline="white", width=2)
         return np.asarray(picture)
