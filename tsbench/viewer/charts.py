@@ -44,7 +44,8 @@ def svg(figure: Figure, name: str, timed: Sequence[Axes] = ()) -> str:
     """
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": name}):
         text = io.StringIO()
-        figure.savefig(text, format="svg", metadata={"Date": None})
+        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(text, format="svg", metadata=nothing)
     frames = []
     for panel in timed:
         box, (begin, end) = panel.get_position(), panel.get_xlim()
