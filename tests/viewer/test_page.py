@@ -371,7 +371,7 @@ class Browser:
 
 
 WIDTH, HEIGHT = 1000, 560
-TRIES, PATIENCE = 6, 40.0  # s
+TRIES, PATIENCE = 6, 90.0  # s
 SCREENSHOTS = Path(__file__).parents[2] / "screenshots"  # kept, for people to look at
 
 
