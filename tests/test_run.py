@@ -255,7 +255,7 @@ def test_a_damaged_file_is_named(
     verb: str, name: str, content: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (Path("one") / name).write_bytes(content)
-    words = {"evaluate": ["--episodes", "1"], "view": ["--html", "page.html"]}
+    words = {"evaluate": ["--protocol", "smoke"], "view": ["--html", "page.html"]}
     if name == "score.json" and verb == "evaluate":
         words = {"evaluate": []}
     assert cli.main([verb, "one", *words[verb]]) == 2
