@@ -76,5 +76,5 @@ bench: setup $(EXTRAS)
 	@$(BIN)/tsbench bench $(ARGS)
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist screenshots .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find tsbench tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, settings
 
 from tsbench import tasks
 from tsbench.motion import Plan, ReferenceMotion
-from tsbench.sim.kinematic import Planning, plan_by_hand
+from tsbench.sim.kinematic import naive_plan
 
 # How fast a machine is, or how busy, is no property of the code.
 settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -24,7 +24,7 @@ settings.load_profile("any")
 
 @cache
 def _naive_plan(name: str) -> Plan:
-    return plan_by_hand(Planning(tasks.make(name)))
+    return naive_plan(tasks.make(name))
 
 
 @cache
@@ -32,8 +32,8 @@ def _naive_reference(name: str) -> ReferenceMotion:
     return tasks.make(name).reference(_naive_plan(name))
 
 
-@pytest.fixture(scope="session")
-def naive_plan() -> Callable[[str], Plan]:
+@pytest.fixture(name="naive_plan", scope="session")
+def naive_plan_fixture() -> Callable[[str], Plan]:
     """Of a task: the plan that its hand-made planner makes."""
     return _naive_plan
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 
 import pytest
 
 from tsbench import gl
+from tsbench.errors import TsbenchError
 
 
 @pytest.mark.parametrize(
@@ -39,3 +41,29 @@ def test_backend(
     monkeypatch.setattr(gl, "find_library", lambda name: name if name in libraries else None)
     gl.choose_backend()
     assert os.environ.get("MUJOCO_GL") == chosen
+
+
+@pytest.mark.parametrize(
+    ("chosen", "works", "taken"),
+    [
+        ("egl", {"egl", "osmesa"}, "egl"),
+        ("egl", {"osmesa"}, "osmesa"),  # EGL is installed but finds no device
+        ("disable", {"osmesa"}, "osmesa"),
+        (None, {None}, None),  # a window system
+    ],
+)
+def test_what_draws_is_found_by_trial(
+    monkeypatch: pytest.MonkeyPatch, chosen: str | None, works: set[str | None], taken: str | None
+) -> None:
+    def trial(*_: object, env: dict[str, str], **__: object) -> subprocess.CompletedProcess[bytes]:
+        return subprocess.CompletedProcess([], 0 if env.get("MUJOCO_GL") in works else 1)
+
+    monkeypatch.setenv("MUJOCO_GL", chosen or "")
+    if chosen is None:
+        monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setattr(subprocess, "run", trial)
+    gl.find_working_backend()
+    assert os.environ.get("MUJOCO_GL") == taken
+    works.clear()
+    with pytest.raises(TsbenchError, match=r"install EGL .* or OSMesa"):
+        gl.find_working_backend()

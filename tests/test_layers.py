@@ -19,7 +19,7 @@ ROOT = Path(tsbench.__file__).parent
 # `problem` is what a method is given; `rl` and `methods` both stand on it.
 MAY_KNOW: dict[str, set[str]] = {
     "errors": set(),
-    "gl": set(),
+    "gl": {"errors"},
     "curves": set(),
     "conf": set(),
     "files": set(),
@@ -36,7 +36,10 @@ MAY_KNOW: dict[str, set[str]] = {
     "evaluation": {"errors", "motion", "mdp", "policy", "adapters", "sim", "tasks"},
     "rl": {"errors", "typed", "mdp", "policy", "problem", "sim"},
     "methods": {"errors", "typed", "motion", "mdp", "policy", "problem", "sim", "planning", "rl"},
-    "viewer": {"errors", "files", "motion", "mdp", "policy", "sim", "evaluation"},
+    "viewer": {
+        "errors", "files", "motion", "mdp", "policy", "sim", "tasks", "evaluation", "record",
+        "tables", "curves",
+    },
     "config": {"errors", "typed", "problem"},
     "record": {"errors", "files", "typed", "motion", "mdp", "policy", "tasks", "config"},
     "tables": {"record"},
@@ -66,7 +69,7 @@ ONLY_IN: dict[str, set[str]] = {
     "hydra": {"config", "launch"},
     "omegaconf": {"config", "launch"},
     "meshcat": {"viewer"},
-    "matplotlib": {"curves"},
+    "matplotlib": {"curves", "viewer"},
     "tensorboard": {"workspace"},
     "rich": {"tables", "workspace", "run", "cli", "launch", "bench"},
 }

@@ -61,6 +61,7 @@ def test_the_directory_holds_everything(shown: tuple[Path, str]) -> None:
         "policy.json",
         "policy.safetensors",
         "reference.npz",
+        "report.html",
         "score.json",
         "tensorboard",
         "versions.json",
@@ -129,7 +130,7 @@ def test_the_table_tells_the_score_the_cost_and_where_to_look(shown: tuple[Path,
         "10 perturbed starts",
         "survival_100N",
         f"tsbench evaluate {directory}",
-        f"{directory / 'view.html'}",
+        f"{directory / 'report.html'}",
     ):
         assert words in text
     assert "plan:" in (directory / "log.txt").read_text()
@@ -254,7 +255,7 @@ def test_a_damaged_file_is_named(
     verb: str, name: str, content: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (Path("one") / name).write_bytes(content)
-    words = {"evaluate": ["--episodes", "1"], "view": ["--html", "page.html"]}
+    words = {"evaluate": ["--protocol", "smoke"], "view": ["--html", "page.html"]}
     if name == "score.json" and verb == "evaluate":
         words = {"evaluate": []}
     assert cli.main([verb, "one", *words[verb]]) == 2

@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tsbench.errors import Stopped, TsbenchError, unknown
+from tsbench.gl import find_working_backend
 
 RUN_HELP = """\
 usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
@@ -46,6 +48,9 @@ examples:
   tsbench run task=rocket_navigation budget=smoke
   tsbench run -m task=laikago_walk,laikago_trot 'seed=range(0,3)'
 """
+
+
+PICTURES = ("--video", "--strip")  # what OpenGL draws
 
 
 class Parser(argparse.ArgumentParser):
@@ -103,6 +108,8 @@ def _dispatch(words: list[str]) -> None:
     elif words[0] in ("-sc", "--shell-completion"):
         _complete(words)
     elif words[0] in VERBS:
+        if words[0] == "view" and any(w.startswith(PICTURES) for w in words):
+            find_working_backend()
         _check_graphics()
         VERBS[words[0]].call(words[1:])
     else:
@@ -292,33 +299,76 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
 
 
 def _threads(word: str) -> int:
-    if not (word.isdecimal() and 1 <= int(word) <= 1024):
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1024, not {word!r}")
+    return _whole_number(word, 1, 1024)
+
+
+def _whole_number(word: str, lowest: int, highest: int) -> int:
+    if not (word.isdecimal() and lowest <= int(word) <= highest):
+        message = f"must be a whole number from {lowest} to {highest}, not {word!r}"
+        raise argparse.ArgumentTypeError(message)
     return int(word)
 
 
 def _view(words: Sequence[str]) -> None:
     parser = _parser("view", json=False)
-    parser.add_argument("run", type=Path, metavar="RUN", help="directory with a policy in it")
-    parser.add_argument("--html", type=Path, metavar="FILE", required=True, help="a new page")
+    what = "a run's directory, a plan's file (plan.npz), or task=NAME"
+    parser.add_argument("what", nargs="?", metavar="RUN|PLAN|task=NAME", help=what)
+    parser.add_argument("--compare", nargs=2, metavar="RUN", help="two runs of one task instead")
+    push = "push the robot for 0.1 s, e.g. 100N@0.5s:+y: newtons, when, where to (axis or degrees)"
+    parser.add_argument("--push", metavar="PUSH", help=push)
+    parser.add_argument("--html", type=Path, metavar="FILE", help="write a page, open no server")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="write an MP4")
+    parser.add_argument("--strip", type=Path, metavar="FILE", help="write a PNG of some moments")
+    port = "of the live view (any that is free)"
+    parser.add_argument("--port", type=_port, metavar="N", default=0, help=port)
     options = parser.parse_args(words)
-    from tsbench import record, tables
-    from tsbench.motion import ReferenceMotion
-    from tsbench.viewer.run_page import write_run_page
+    if (options.what is None) == (options.compare is None):
+        parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
+    from tsbench.viewer import film, page, serve
+    from tsbench.viewer.pushes import parse_push
+    from tsbench.viewer.show import Show
+    from tsbench.viewer.subject import pair, subject
 
-    policy, task = record.read_policy(options.run)
-    reference = options.run / record.REFERENCE
-    finished = (options.run / record.SCORE).exists()
-    score = record.read_score(options.run) if finished else None
-    write_run_page(
-        options.html,
-        task,
-        policy,
-        ReferenceMotion.load(reference) if reference.exists() else None,
-        title=tables.run_title(score) if score else task.name,
-        summary=tables.summary(score) if score else [],
-    )
-    sys.stdout.write(f"{options.html}\n")
+    def show(push: str | None) -> Show:
+        force = None if push is None else parse_push(push)
+        return (
+            pair(options.compare, force) if options.compare else subject(options.what).show(force)
+        )
+
+    shown = show(options.push)
+    if options.html:
+        page.write(options.html, page.render(shown))
+    if options.video:
+        film.write_video(shown, options.video)
+    if options.strip:
+        film.write_strip(shown, options.strip)
+    written = [str(path) for path in (options.html, options.video, options.strip) if path]
+    if written:
+        sys.stdout.write("\n".join(written) + "\n")
+        return
+    running = serve.server(lambda push: page.render(show(push), served=True), options.port)
+    sys.stdout.write(f"{serve.address(running, options.push)} (Ctrl-C ends it)\n")
+    sys.stdout.flush()
+    with running, suppress(KeyboardInterrupt):
+        running.serve_forever()
+
+
+def _port(word: str) -> int:
+    return _whole_number(word, 0, 65535)
+
+
+def _report(words: Sequence[str]) -> None:
+    parser = _parser("report", json=False)
+    parser.add_argument("run", type=Path, metavar="RUN", help="a finished run's directory")
+    what = "the page to write, a new one (RUN/report.html)"
+    parser.add_argument("--html", type=Path, metavar="FILE", help=what)
+    options = parser.parse_args(words)
+    from tsbench import record
+    from tsbench.viewer import page, report
+
+    path = options.html or options.run / record.REPORT
+    page.write(path, report.render(options.run))
+    sys.stdout.write(f"{path}\n")
 
 
 def _bench(words: Sequence[str]) -> None:
@@ -340,7 +390,8 @@ def _bench(words: Sequence[str]) -> None:
 VERBS = {
     "run": Verb("train a policy and evaluate it", _run),
     "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
-    "view": Verb("write a page that plays a run's motion", _view),
+    "view": Verb("see a run, a plan or a task move: live, as a page or as a video", _view),
+    "report": Verb("write one page about a run: what was planned, done and learned", _report),
     "bench": Verb("measure how fast it is, side by side with others", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }

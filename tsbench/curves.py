@@ -10,12 +10,11 @@ from matplotlib.figure import Figure
 MEASURE = "episode_return"
 
 
-def draw(metrics: Path, picture: Path) -> None:
-    """Draws the return against environment steps, one panel for each stage.
+def figure(metrics: Path) -> Figure | None:
+    """The return against environment steps, one panel for each stage.
 
     Args:
-        metrics: a run's `metrics.jsonl`; without returns in it nothing is drawn.
-        picture: the PNG to write.
+        metrics: a run's `metrics.jsonl`; without returns in it there is nothing to draw.
     """
     curves: dict[str, tuple[list[int], list[float]]] = {}
     for line in metrics.read_text(encoding="utf-8").splitlines():
@@ -25,11 +24,22 @@ def draw(metrics: Path, picture: Path) -> None:
             steps.append(row["steps"])
             returns.append(row[MEASURE])
     if not curves:
-        return
-    figure = Figure(figsize=(4.5 * len(curves), 3.2), layout="constrained")
-    panels = figure.subplots(1, len(curves), squeeze=False)[0]
+        return None
+    drawn = Figure(figsize=(4.5 * len(curves), 3.2), layout="constrained")
+    panels = drawn.subplots(1, len(curves), squeeze=False)[0]
     for panel, (stage, (steps, returns)) in zip(panels, curves.items(), strict=True):
         panel.plot(steps, returns)
         panel.set(title=stage, xlabel="environment steps", ylabel="episode return of the stage")
         panel.grid(alpha=0.3)
-    figure.savefig(picture, dpi=120)
+    return drawn
+
+
+def draw(metrics: Path, picture: Path) -> None:
+    """Writes them as a PNG, if there are any.
+
+    Args:
+        metrics: a run's `metrics.jsonl`.
+        picture: the PNG to write.
+    """
+    if drawn := figure(metrics):
+        drawn.savefig(picture, dpi=120)

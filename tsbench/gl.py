@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from ctypes.util import find_library
+
+from tsbench.errors import TsbenchError
+
+TRIAL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 
 
 def choose_backend() -> None:
@@ -19,3 +24,25 @@ def choose_backend() -> None:
     libraries = {"egl": "EGL", "osmesa": "OSMesa"}
     found = (name for name, library in libraries.items() if find_library(library))
     os.environ["MUJOCO_GL"] = next(found, "disable")
+
+
+def find_working_backend() -> None:
+    """Sets MUJOCO_GL to one that draws: what it says already if that works, else EGL or OSMesa.
+
+    A library that is installed may still find nothing to draw on, which only a trial tells.
+
+    Raises:
+        TsbenchError: none works.
+    """
+    for backend in dict.fromkeys((os.environ.get("MUJOCO_GL"), "egl", "osmesa")):
+        changes = {} if backend is None else {"MUJOCO_GL": backend}
+        done = subprocess.run(
+            [sys.executable, "-c", TRIAL], env={**os.environ, **changes}, capture_output=True
+        )
+        if done.returncode == 0:
+            os.environ.update(changes)
+            return
+    raise TsbenchError(
+        "no OpenGL draws pictures here: install EGL (Debian: libegl1 libgl1-mesa-dri) or OSMesa "
+        "(Debian: libosmesa6)"
+    )

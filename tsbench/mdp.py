@@ -132,6 +132,11 @@ class MDP(ABC, Generic[S]):
     def terminal(self, state: S) -> Array:
         """Whether the episode ends here for a reason other than its last step, shape (...,)."""
 
+    def reward_terms(self, previous: S, action: Array, state: S) -> dict[str, Array]:
+        """What the reward is made of, by name, each of shape (...,), for people to look at. How
+        the terms combine is each task's own; by default there is only the reward itself."""
+        return {"reward": self.reward(previous, action, state)}
+
     def reached(self, state: S) -> Array:
         """Whether the ending is the goal; the missing steps then count as perfect ones."""
         return state.time < 0.0
@@ -196,6 +201,47 @@ class Tracker(Generic[S]):
     terminal: Callable[[S], Array]
     start: Callable[[Rng, int], Start]
     horizon: int
+
+
+@dataclass(frozen=True)
+class Flame:
+    """What an engine looks like while it works.
+
+    Attributes:
+        body: that carries it.
+        actuator: whose control makes it.
+        nozzle: where it begins, in the body's frame in metres.
+        direction: where it points to, in the body's frame, of length 1.
+        length: metres per unit of control; negative where negative controls make it.
+    """
+
+    body: str
+    actuator: str
+    nozzle: tuple[float, float, float]
+    direction: tuple[float, float, float]
+    length: float
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What pictures of a task show beyond its model.
+
+    Attributes:
+        feet: the geoms that are to touch the ground, each named as its foot.
+        contacts: seconds (...,) -> whether each foot is to be on the ground, (..., feet), or None
+            where nothing says so.
+        flames: of engines.
+        bounds: lowest and highest corner of the world in metres, where it has an edge. A flat
+            world has both at the same coordinate across it.
+        worth: positions (n, 3) -> the reward of a robot's being there (n,); drawn over a flat
+            world's bounds.
+    """
+
+    feet: tuple[str, ...] = ()
+    contacts: Callable[[np.ndarray], np.ndarray] | None = None
+    flames: tuple[Flame, ...] = ()
+    bounds: tuple[np.ndarray, np.ndarray] | None = None
+    worth: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 class Task(MDP[S]):
@@ -273,6 +319,10 @@ class Task(MDP[S]):
         if form not in self.imitation_forms:
             raise unknown(f"imitation reward of {self.name}", form, self.imitation_forms)
         return form
+
+    def drawing(self) -> Drawing:
+        """What pictures show beyond the model."""
+        return Drawing()
 
     def constants(self) -> dict[str, Any]:
         """The values that define the task; a score made with others cannot be ranked."""

@@ -69,15 +69,7 @@ class _Recording:
         Raises:
             TsbenchError: the file is missing, damaged, or of another kind.
         """
-        path = Path(path)
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                content = {name: file[name] for name in file.files}
-        except FileNotFoundError:
-            raise TsbenchError(f"no {cls.kind} at {path}") from None
-        except _DAMAGE as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise TsbenchError(f"damaged {cls.kind} file {path}: {reason}") from None
+        content = _content(Path(path), cls.kind)
         found = str(content.pop("kind", "unknown"))
         if found != cls.kind:
             raise TsbenchError(f"{path} is not a {cls.kind} file (it says: {found})")
@@ -89,6 +81,22 @@ class _Recording:
             return cls(**{name: _plain(value) for name, value in content.items()})
         except (TsbenchError, TypeError, ValueError, AttributeError) as error:
             raise TsbenchError(f"damaged {cls.kind} file {path}: {error}") from None
+
+
+def _content(path: Path, kind: str) -> dict[str, np.ndarray]:
+    """The arrays of a recording's file.
+
+    Raises:
+        TsbenchError: the file is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise TsbenchError(f"no {kind} at {path}") from None
+    except _DAMAGE as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise TsbenchError(f"damaged {kind} file {path}: {reason}") from None
 
 
 def _plain(value: np.ndarray) -> Any:
@@ -166,6 +174,16 @@ class ReferenceMotion(_Recording):
     def frame(self, time: np.ndarray) -> np.ndarray:
         """Index of the frame at each time in seconds; the last one beyond the end."""
         return np.clip(np.rint(time / self.timestep).astype(int), 0, self.steps)
+
+
+def read_motion(path: Path | str) -> Plan | ReferenceMotion:
+    """Reads a plan or a reference motion, whichever the file holds.
+
+    Raises:
+        TsbenchError: the file is missing, damaged, or neither.
+    """
+    found = str(_content(Path(path), "plan").get("kind"))
+    return ReferenceMotion.load(path) if found == ReferenceMotion.kind else Plan.load(path)
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ SCORE = "score.json"
 ACTIONS = "actions.npz"
 CURVES = "learning_curves.png"
 PAGE = "view.html"
+REPORT = "report.html"
 # What an entry keeps of a run; the first line of its configuration is the command.
 KEPT = (CONFIG, VERSIONS, "policy.json", "policy.safetensors", PLAN, REFERENCE, SCORE)
 

@@ -29,7 +29,6 @@ from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors,
 from tsbench.evaluation.evaluate import Score, evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.files import PART, write_whole
-from tsbench.motion import ReferenceMotion
 from tsbench.problem import Problem
 from tsbench.record import (
     ACTIONS,
@@ -39,7 +38,7 @@ from tsbench.record import (
     DUMP,
     METRICS,
     PAGE,
-    REFERENCE,
+    REPORT,
     SCORE,
     VERSIONS,
     read_config,
@@ -48,7 +47,7 @@ from tsbench.record import (
 )
 from tsbench.rl.stages import KINDS, settings
 from tsbench.sim.model import fingerprint
-from tsbench.viewer.run_page import write_run_page
+from tsbench.viewer.report import write_run_pages
 from tsbench.workspace import RunWorkspace
 
 # What can change a number in a run.
@@ -137,7 +136,7 @@ def resume(directory: Path, console: Console | None = None) -> Score:
         config = replace(read_config(directory), directory=str(directory))
         problem = prepare(config)
         _check_provenance(directory, config, problem)
-        for path in (directory / PAGE, *directory.rglob(f"*{PART}")):
+        for path in (directory / PAGE, directory / REPORT, *directory.rglob(f"*{PART}")):
             path.unlink(missing_ok=True)
         line = f"tsbench run resume={directory}"
         return _work(config, problem, directory, line, console or Console())
@@ -263,15 +262,7 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
         "stages": workspace.stage_rows(),
     }
     curves.draw(directory / METRICS, directory / CURVES)
-    reference = directory / REFERENCE
-    write_run_page(
-        directory / PAGE,
-        problem.task,
-        policy,
-        ReferenceMotion.load(reference) if reference.exists() else None,
-        title=tables.run_title(record),
-        summary=tables.summary(record),
-    )
+    write_run_pages(directory, record)
     write_json(directory / SCORE, record)  # last: its presence says that the run is finished
     tables.show_run(console, record, directory)
     return score

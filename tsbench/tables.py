@@ -11,7 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from tsbench.record import CURVES, PAGE
+from tsbench.record import REPORT
 
 
 def duration(seconds: float) -> str:
@@ -80,8 +80,7 @@ def show_run(console: Console, record: Mapping[str, Any], directory: Path) -> No
         table.add_row(stage["name"], f"{stage['steps']:,}", duration(stage["seconds"]))
     console.print(table)
     for what, where in (
-        ("see it move", directory / PAGE),
-        ("how it learned", directory / CURVES),
+        ("what came out", directory / REPORT),
         ("score it again", f"tsbench evaluate {directory}"),
     ):
         console.print(f" {what:<17} {where}", markup=False, highlight=False, soft_wrap=True)
@@ -92,11 +91,20 @@ def run_title(record: Mapping[str, Any]) -> str:
 
 
 def summary(record: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Labels and values of a run's score in short."""
+    """Labels and values of a run's score in short, in words that need no explanation."""
     score = record["score"]
-    names = ("normalized_reward", "optimality", "success")
-    pushed = ("survival_100N", "impulse_50")
-    return [
-        *((name, number(score[name])) for name in names),
-        *((name, number(score["robustness"][name])) for name in pushed),
+    perturbed = score["perturbed"]
+    episodes = perturbed["episodes"]
+    solved, spoiled = (round(perturbed[name] * episodes) for name in ("success", "violations"))
+    rows = [
+        ("of the largest possible reward", f"{score['normalized_reward']:.1%}"),
+        ("of the best known reward", f"{score['optimality']:.1%}"),
+        ("solved from other starts", f"{solved} of {episodes}"),
+        ("falls and collisions there", f"{spoiled} of {episodes}"),
     ]
+    if robustness := score.get("robustness"):
+        rows.append(("pushes of 100 N survived", f"{robustness['survival_100N']:.0%}"))
+        bound = "over " if robustness["impulse_50_is_lower_bound"] else ""
+        impulse = f"{bound}{number(robustness['impulse_50'])} N s"
+        rows.append(("impulse that half survive", impulse))
+    return rows

@@ -29,7 +29,7 @@ def idle(size: int) -> PolicyFunction:
 
 def few(episodes: int) -> Protocol:
     """A protocol of seconds."""
-    return replace(SMOKE, perturbed=episodes, phases=16, forces=(100.0,), headings=2)
+    return replace(SMOKE, perturbed=episodes, conditions=(), phases=16, forces=(100.0,), headings=2)
 
 
 def artefact(name: str, seed: int = 0, **constants: Any) -> Policy:

@@ -123,7 +123,9 @@ def pile(memory: int) -> mujoco.MjSpec:
     spec.memory = memory
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5.0, 5.0, 1.0])
     for i in range(20):
-        ball = spec.worldbody.add_body(pos=[0.15 * (i % 5), 0.15 * (i // 5), 0.099])
+        ball = spec.worldbody.add_body(
+            name=f"ball_{i}", pos=[0.15 * (i % 5), 0.15 * (i // 5), 0.099]
+        )
         ball.add_freejoint()
         ball.add_geom(size=[0.1, 0.0, 0.0])
     return spec
@@ -135,6 +137,7 @@ def piled(task: Task[Any], memory: int) -> Physics[Any]:
     start = Start(np.zeros(3), qpos, np.zeros((3, 120)), np.zeros((3, 0)))
     changed = altered(
         task,
+        pushed="ball_0",
         spec=lambda: pile(memory),
         start=lambda *_, **__: start,
         control=lambda state, action: (np.zeros((3, 0)), np.zeros((3, 0))),

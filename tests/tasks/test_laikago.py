@@ -73,8 +73,9 @@ STEP = 1 / 30
 
 
 def terms(task: Laikago, previous: LaikagoState, after: LaikagoState) -> list[float]:
-    values = [float(term[0]) for term in task.reward_terms(previous, after)]
-    reward = task.reward(previous, np.zeros((1, 12)), after)[0]
+    action = np.zeros((1, 12))
+    values = [float(term[0]) for term in task.reward_terms(previous, action, after).values()]
+    reward = task.reward(previous, action, after)[0]
     assert reward == pytest.approx(values[0] * values[1] * values[2] * values[3])
     return values
 

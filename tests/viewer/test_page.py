@@ -10,10 +10,12 @@ import re
 import shutil
 import signal
 import subprocess
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import dm_control.suite
 import mujoco
 import numpy as np
 import pytest
@@ -22,8 +24,20 @@ from PIL import Image
 
 from tsbench.errors import TsbenchError
 from tsbench.sim.model import load_spec
-from tsbench.viewer import page, scene
-from tsbench.viewer.page import Actor, write_page
+from tsbench.viewer import page, report, scene
+from tsbench.viewer.framing import framing
+from tsbench.viewer.pushes import parse_push
+from tsbench.viewer.show import (
+    EXECUTED_COLOUR,
+    PLAN_COLOUR,
+    PUSH_COLOUR,
+    SKY,
+    Actor,
+    Show,
+    landmarks,
+    track,
+)
+from tsbench.viewer.subject import subject
 
 LAIKAGO_GOAL = (1.5, 0.0, 0.0)
 ROCKET_GOAL = (52.0, 0.0, 30.0)
@@ -61,6 +75,27 @@ def flight(timestep: float, late: float = 0.0) -> scene.Array:
     sway = np.sin(np.pi * progress)
     x, _, z = ROCKET_GOAL
     return np.stack([x * progress, z * progress - 3.0 * sway, -0.5 * sway], axis=1)
+
+
+def show(
+    model: mujoco.MjModel,
+    executed: scene.Array,
+    timestep: float,
+    *,
+    ghost: scene.Array | None = None,
+    ghost_timestep: float | None = None,
+    title: str = "",
+    summary: list[tuple[str, str]] | None = None,
+) -> Show:
+    """Bare motions, with nothing to explain them."""
+    actors = [Actor("executed", executed, timestep, EXECUTED_COLOUR, "")]
+    if ghost is not None:
+        actors.append(Actor("plan", ghost, ghost_timestep or timestep, PLAN_COLOUR, "", ghost=True))
+    return Show(model=model, actors=actors, title=title, summary=summary or [])
+
+
+def write_page(path: Path, *motions: Any, **words: Any) -> None:
+    page.write(path, page.render(show(*motions, **words)))
 
 
 def data_of(text: str) -> dict[str, Any]:
@@ -105,8 +140,9 @@ def test_writing_starts_no_process(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_equal_motions_give_equal_pages() -> None:
     model = rocket()
-    actor = Actor("executed", flight(0.02), 0.02, page.EXECUTED_COLOUR, "")
-    assert page.render(model, [actor], "", []) == page.render(model, [actor], "", [])
+    assert page.render(show(model, flight(0.02), 0.02)) == page.render(
+        show(model, flight(0.02), 0.02)
+    )
 
 
 def test_texts_cannot_break_the_page(tmp_path: Path) -> None:
@@ -122,14 +158,12 @@ def test_texts_cannot_break_the_page(tmp_path: Path) -> None:
     assert data_of(text)["actors"][0]["base"].startswith("meshcat/executed/<:script><b onload")
 
 
-def test_an_existing_page_is_kept_unless_told(tmp_path: Path) -> None:
+def test_an_existing_page_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "p.html"
     path.write_text("mine")
     with pytest.raises(TsbenchError, match="exists already"):
         write_page(path, rocket(), flight(0.02), 0.02, title="")
     assert path.read_text() == "mine"
-    write_page(path, rocket(), flight(0.02), 0.02, title="", overwrite=True)
-    assert path.read_text("utf-8").startswith("<!DOCTYPE html>")
 
 
 @pytest.mark.parametrize("place", ["missing/p.html", "file/p.html"])
@@ -141,7 +175,6 @@ def test_an_unwritable_place_is_named(tmp_path: Path, place: str) -> None:
 
 def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "p.html"
-    path.write_text("mine")
 
     def fill(self: Path, text: str, *_: object) -> None:
         self.write_bytes(text[:100].encode())
@@ -149,9 +182,8 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(Path, "write_text", fill)
     with pytest.raises(TsbenchError, match="No space left"):
-        write_page(path, rocket(), flight(0.02), 0.02, title="", overwrite=True)
-    assert [file.name for file in tmp_path.iterdir()] == ["p.html"]
-    assert path.read_text() == "mine"
+        write_page(path, rocket(), flight(0.02), 0.02)
+    assert not list(tmp_path.iterdir())
 
 
 def test_motions_of_another_model_are_refused(tmp_path: Path) -> None:
@@ -173,11 +205,11 @@ def test_motions_of_another_model_are_refused(tmp_path: Path) -> None:
 def test_tracks_are_thinned_and_keep_the_end() -> None:
     model = rocket()
     qpos = flight(1 / 600)
-    found = page.track(model, Actor("executed", qpos, 1 / 600, page.EXECUTED_COLOUR, ""))
+    found = track(model, Actor("executed", qpos, 1 / 600, EXECUTED_COLOUR, ""))
     np.testing.assert_allclose(np.diff(found.times)[:-1], 1 / 60)
     assert found.times[-1] == pytest.approx((len(qpos) - 1) / 600)
     np.testing.assert_array_equal(found.positions[-1, 1, [0, 2]], qpos[-1, :2])
-    slow = page.track(model, Actor("plan", qpos, 0.05, page.PLAN_COLOUR, ""))
+    slow = track(model, Actor("plan", qpos, 0.05, PLAN_COLOUR, ""))
     assert len(slow.times) == len(qpos)
 
 
@@ -247,8 +279,8 @@ def test_goal_and_obstacles_are_explained(tmp_path: Path) -> None:
 def test_the_camera_looks_from_where_motion_goes_from_left_to_right() -> None:
     start = np.zeros(3)
     model = rocket()
-    actor = Actor("executed", flight(0.02), 0.02, page.EXECUTED_COLOUR, "")
-    view = page.framing(model, start, [page.track(model, actor)], page.landmarks(model))
+    actor = Actor("executed", flight(0.02), 0.02, EXECUTED_COLOUR, "")
+    view = framing(model, start, [track(model, actor)], landmarks(model))
     assert view.flat
     assert view.direction == (0.0, -1.0, 0.0)
     assert 0.5 < view.size < 1.5
@@ -261,8 +293,8 @@ def test_the_camera_looks_from_where_motion_goes_from_left_to_right() -> None:
         qpos = trot(model, 0.0, 1 / 30, 2.0)
         along = np.linspace(0.0, 2.0, len(qpos))
         qpos[:, :2] = np.stack([along * math.cos(heading), along * math.sin(heading)], axis=1)
-        actor = Actor("executed", qpos, 1 / 30, page.EXECUTED_COLOUR, "")
-        view = page.framing(model, qpos[0], [page.track(model, actor)], [])
+        actor = Actor("executed", qpos, 1 / 30, EXECUTED_COLOUR, "")
+        view = framing(model, qpos[0], [track(model, actor)], [])
         assert not view.flat
         to_the_right = np.cross([0.0, 0.0, 1.0], view.direction)
         assert to_the_right @ [math.cos(heading), math.sin(heading), 0.0] > 0.9
@@ -327,7 +359,9 @@ class Browser:
 
     def picture(self, path: Path, address: str) -> NDArray[np.int64]:
         """What is seen of a page between its card and its bar, shape (rows, columns, 3)."""
-        image = self.folder / f"{path.stem}_{re.sub('[^a-z0-9]+', '_', address)}.png"
+        SCREENSHOTS.mkdir(exist_ok=True)
+        image = SCREENSHOTS / f"{path.stem}_{re.sub('[^a-z0-9]+', '_', address)}.png"
+        image.unlink(missing_ok=True)
         url = f"{path.as_uri()}#{address}"
         self.run(url, "--virtual-time-budget=1500", f"--screenshot={image}")
         assert image.is_file(), "Chromium took no picture"
@@ -337,7 +371,8 @@ class Browser:
 
 
 WIDTH, HEIGHT = 1000, 560
-TRIES, PATIENCE = 6, 40.0  # s
+TRIES, PATIENCE = 6, 90.0  # s
+SCREENSHOTS = Path(__file__).parents[2] / "screenshots"  # kept, for people to look at
 
 
 @pytest.fixture
@@ -367,7 +402,7 @@ def dark(pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def solid(pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
     """What is neither sky nor a thin line on it."""
-    return np.abs(pixels - page.SKY).max(axis=-1) > 25
+    return np.abs(pixels - SKY).max(axis=-1) > 25
 
 
 @pytest.mark.browser
@@ -434,3 +469,46 @@ def test_a_page_plays_when_opened_and_rests_where_asked(browser: Browser, tmp_pa
     assert shown("") > 0.0
     assert shown("#t=1.25") == 1.25
     assert shown("#t=99") == 11.98
+
+
+@pytest.mark.browser
+def test_a_push_is_seen_while_it_lasts(
+    browser: Browser, make_run: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "push.html"
+    shown = subject(str(make_run("laikago_trot"))).show(parse_push("100N@0.5s:+y"))
+    page.write(path, page.render(shown))
+    assert path.stat().st_size < 2e6
+    during, after = browser.picture(path, "t=0.55&view=follow"), browser.picture(path, "t=0.7")
+
+    def pixels_of(picture: NDArray[np.int64], colour: tuple[float, float, float]) -> int:
+        return int(np.all(np.abs(picture - 255 * np.array(colour)) < 30, axis=-1).sum())
+
+    assert pixels_of(during, PUSH_COLOUR) > 300
+    assert pixels_of(after, PUSH_COLOUR) == 0
+    assert pixels_of(during, EXECUTED_COLOUR) > 50  # the feet stand
+
+
+@pytest.mark.browser
+def test_a_report_follows_its_view(browser: Browser, make_run: Callable[..., Path]) -> None:
+    run = make_run("rocket_obstacles", 0.7)
+    path = run / "report.html"
+    page.write(path, report.render(run))
+    printed = browser.run(path.as_uri(), "--virtual-time-budget=1500", "--dump-dom")
+    heads = re.findall(r'<i style="[^"]*left: ([\d.]+)%;"></i>', printed)
+    assert len(heads) == 4 + 3  # reward and its terms, joints
+    browser.run(
+        path.as_uri(), "--virtual-time-budget=1500", f"--screenshot={SCREENSHOTS}/report.png"
+    )
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", ["quadruped", "fish"])
+def test_models_of_others_are_rendered(browser: Browser, tmp_path: Path, name: str) -> None:
+    """Between them: a plane, a height field, capsules, cylinders, ellipsoids, boxes, sites."""
+    model = mujoco.MjModel.from_xml_path(
+        str(Path(dm_control.suite.__file__).with_name(f"{name}.xml"))
+    )
+    path = tmp_path / f"{name}.html"
+    write_page(path, model, np.tile(model.qpos0, (2, 1)), 0.1)
+    assert solid(browser.picture(path, "t=0&view=follow")).sum() > 5000

@@ -20,7 +20,7 @@ from tsbench.problem import Problem
 from tsbench.record import METRICS
 from tsbench.rl.stages import learn_physics, learn_planning, settings
 from tsbench.run import prepare
-from tsbench.sim.kinematic import Planning, plan_by_hand
+from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.tracking import Imitation
 from tsbench.workspace import RunWorkspace
 
@@ -47,7 +47,7 @@ def train(problem: Problem, stage: str, steps: int) -> list[dict[str, float]]:
         if stage == "plan":
             learn_planning(problem, workspace, steps)
         else:
-            reference = problem.task.reference(plan_by_hand(Planning(problem.task)))
+            reference = problem.task.reference(naive_plan(problem.task))
             imitation = Imitation(problem.task, reference)
             learn_physics(problem, workspace, stage, imitation, stage, steps)
         workspace.close()

@@ -78,8 +78,9 @@ class Planning(MDP[S]):
         self.explore = snapshot["explore"]
 
 
-def plan_by_hand(planning: Planning[Any]) -> Plan:
-    """The plan that the abstraction's hand-made planner makes."""
+def naive_plan(task: Task[S]) -> Plan:
+    """The plan that a task's hand-made planner makes, without learning."""
+    planning = Planning(task)
     abstraction = planning.abstraction
     state = abstraction.start(1)
     states = [abstraction.flatten(state)[0]]
@@ -87,13 +88,7 @@ def plan_by_hand(planning: Planning[Any]) -> Plan:
     while len(rewards) < planning.horizon and not planning.terminal(state)[0]:
         action = abstraction.naive(state)
         following = planning.advance(state, action)
-        rewards.append(planning.reward(state, action, following)[0])
+        rewards.append(float(planning.reward(state, action, following)[0]))
         states.append(abstraction.flatten(following)[0])
         state = following
-    return Plan(
-        task=planning.name,
-        task_version=planning.version,
-        timestep=planning.timestep,
-        states=np.array(states),
-        rewards=np.array(rewards),
-    )
+    return Plan(task.name, task.version, planning.timestep, np.array(states), np.array(rewards))

@@ -16,7 +16,7 @@ import numpy as np
 from array_api_compat import array_namespace
 from scipy.interpolate import PchipInterpolator
 
-from tsbench.mdp import Abstraction, Array, Readings, Rng, Start, State, Task, Tracker
+from tsbench.mdp import Abstraction, Array, Drawing, Readings, Rng, Start, State, Task, Tracker
 from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
 from tsbench.planning.ik import FootPoses
 from tsbench.sim.model import compiled, load_spec
@@ -180,8 +180,8 @@ class Laikago(Task[LaikagoState]):
         return xp.linalg.vector_norm(self._goal_offset(state), axis=-1)
 
     def reward_terms(
-        self, previous: LaikagoState, state: LaikagoState
-    ) -> tuple[Array, Array, Array, Array]:
+        self, previous: LaikagoState, action: Array, state: LaikagoState
+    ) -> dict[str, Array]:
         """r_dist, r_ns, r_ee_z, r_ee_x, whose product is the reward, each shape (...,) (P).
 
         r_dist = exp(-2.5 |x - goal|), on the ground plane.
@@ -195,15 +195,15 @@ class Laikago(Task[LaikagoState]):
         moved = state.feet - previous.feet
         slip = xp.where(stance, xp.linalg.vector_norm(moved[..., :2], axis=-1), 0.0)
         height_error = state.feet[..., 2] - FOOT_RADIUS - xp.where(contacts, 0.0, SWING_HEIGHT)
-        return (
-            xp.exp(DISTANCE_DECAY * self.goal_distance(state)),
-            xp.exp(SLIP_DECAY * xp.sum(slip, axis=-1)),
-            xp.exp(HEIGHT_DECAY * xp.sum(xp.abs(height_error), axis=-1)),
-            xp.exp(MOTION_DECAY * xp.sum(xp.abs(moved[..., 0]), axis=-1)),
-        )
+        return {
+            "near the goal": xp.exp(DISTANCE_DECAY * self.goal_distance(state)),
+            "feet do not slip": xp.exp(SLIP_DECAY * xp.sum(slip, axis=-1)),
+            "feet at their height": xp.exp(HEIGHT_DECAY * xp.sum(xp.abs(height_error), axis=-1)),
+            "feet move little": xp.exp(MOTION_DECAY * xp.sum(xp.abs(moved[..., 0]), axis=-1)),
+        }
 
     def reward(self, previous: LaikagoState, action: Array, state: LaikagoState) -> Array:
-        distance, no_slip, height, motion = self.reward_terms(previous, state)
+        distance, no_slip, height, motion = self.reward_terms(previous, action, state).values()
         return distance * no_slip * height * motion
 
     def fallen(self, state: LaikagoState) -> Array:
@@ -238,6 +238,9 @@ class Laikago(Task[LaikagoState]):
             rgba=[0.95, 0.75, 0.1, 1.0],
         )
         return spec
+
+    def drawing(self) -> Drawing:
+        return Drawing(feet=FEET, contacts=self.gait.contacts)
 
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """Standing at the origin in the nominal pose, at rest (P fixed, D pose).

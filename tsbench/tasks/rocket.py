@@ -13,7 +13,18 @@ import mujoco
 import numpy as np
 from array_api_compat import array_namespace
 
-from tsbench.mdp import Abstraction, Array, Readings, Rng, Start, State, Task, Tracker
+from tsbench.mdp import (
+    Abstraction,
+    Array,
+    Drawing,
+    Flame,
+    Readings,
+    Rng,
+    Start,
+    State,
+    Task,
+    Tracker,
+)
 from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
 from tsbench.sim.model import load_spec
 from tsbench.tasks import register
@@ -26,6 +37,12 @@ GOAL_WEIGHT, GOAL_DECAY = 0.9, -0.25  # w1, k1 (P)
 OBSTACLE_WEIGHT, OBSTACLE_DECAY = 0.075, -0.5  # w2 = w3, k2 = k3 (P)
 OBSTACLE_RADIUS = 0.5  # m (D)
 HULL_RADIUS = 0.72  # m, to the lander's farthest corner: what a plan keeps clear at any angle (D)
+
+FLAMES = (  # from the nozzles in models/rocket.xml; a positive side force leaves on the right
+    Flame("rocket", "main", (0.0, 0.0, -0.58), (0.0, 0.0, -1.0), length=0.03),
+    Flame("rocket", "side", (0.59, 0.0, 0.365), (1.0, 0.0, 0.0), length=0.05),
+    Flame("rocket", "side", (-0.59, 0.0, 0.365), (-1.0, 0.0, 0.0), length=-0.05),
+)
 
 PLAN_TIMESTEP = 1 / 20  # s (P)
 PLAN_STEP = 0.25  # m per axis and plan step (P)
@@ -129,15 +146,21 @@ class Rocket(Task[RocketState]):
         xp = array_namespace(state.position)
         return xp.linalg.vector_norm(state.position - xp.asarray(self.goal), axis=-1)
 
-    def reward(self, previous: RocketState, action: Array, state: RocketState) -> Array:
-        """R = w1 exp(k1 |x - goal|) - sum over obstacles of w2 exp(k2 |x - obstacle|) (P)."""
+    def reward_terms(
+        self, previous: RocketState, action: Array, state: RocketState
+    ) -> dict[str, Array]:
+        """w1 exp(k1 |x - goal|) and, of each obstacle, -w2 exp(k2 |x - obstacle|) (P)."""
         xp = array_namespace(state.position)
-        reward = GOAL_WEIGHT * xp.exp(GOAL_DECAY * self.goal_distance(state))
-        for obstacle in self.obstacles:
+        terms = {"near the goal": GOAL_WEIGHT * xp.exp(GOAL_DECAY * self.goal_distance(state))}
+        for number, obstacle in enumerate(self.obstacles, 1):
             offset = state.position - xp.asarray(obstacle)
             distance = xp.linalg.vector_norm(offset, axis=-1)
-            reward = reward - OBSTACLE_WEIGHT * xp.exp(OBSTACLE_DECAY * distance)
-        return reward
+            terms[f"near obstacle {number}"] = -OBSTACLE_WEIGHT * xp.exp(OBSTACLE_DECAY * distance)
+        return terms
+
+    def reward(self, previous: RocketState, action: Array, state: RocketState) -> Array:
+        """R, the sum of its terms (P)."""
+        return sum(self.reward_terms(previous, action, state).values())
 
     def terminal(self, state: RocketState) -> Array:
         """Out of bounds (P)."""
@@ -185,6 +208,17 @@ class Rocket(Task[RocketState]):
                 cutoff=1e3,
             )
         return spec
+
+    def drawing(self) -> Drawing:
+        low, high = (np.array([x, 0.0, z]) for x, z in self.bounds)
+
+        def worth(position: np.ndarray) -> np.ndarray:
+            still = np.zeros(len(position))
+            state = self._kinematic(still, position[:, [0, 2]], still)
+            reward: np.ndarray = self.reward(state, still, state)
+            return reward
+
+        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth)
 
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """At the origin, at rest, upright (P).

@@ -14,7 +14,6 @@ import json
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +23,29 @@ import mujoco
 import numpy as np
 import umsgpack
 from meshcat import Visualizer
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tsbench.errors import TsbenchError
 from tsbench.files import write_whole
 from tsbench.viewer import scene
-from tsbench.viewer.scene import Array, Colour
-
-# Okabe and Ito's vermilion and blue, which colour-blind readers can tell apart.
-EXECUTED_COLOUR = (0.84, 0.37, 0.0)
-PLAN_COLOUR = (0.0, 0.45, 0.70)
-GHOST_OPACITY = 0.4
-INK, PENCIL = (0.11, 0.15, 0.2), (0.68, 0.74, 0.8)  # of labels, of grid lines
-SKY = (208, 220, 231)  # red, green, blue of 255; distant ground fades into it
+from tsbench.viewer.framing import Framing, framing
+from tsbench.viewer.scene import Array
+from tsbench.viewer.show import (
+    EXECUTED_COLOUR,
+    GHOST_OPACITY,
+    INK,
+    PENCIL,
+    PLAN_COLOUR,
+    SKY,
+    Actor,
+    Band,
+    Curve,
+    Entry,
+    Prop,
+    Show,
+    Track,
+    track,
+)
 
 # Of meshcat's own scene: its point lights reach 10 m, too little for a rocket.
 UNWANTED = ("/Grid", "/Axes", "/Lights/PointLightNegativeX", "/Lights/PointLightPositiveX")
@@ -47,23 +56,16 @@ LICENCES = (
     "dist/main.min.js.THIRD_PARTY_LICENSES.json",
 )
 
-EXECUTED_NOTE = (
-    "what the policy did, with physics: the robot in its own colours, its path in orange"
-)
-PLAN_NOTE = "what it was to do, planned without physics: translucent blue"
-
-KEYFRAMES_PER_SECOND = 60.0  # more cannot be seen
 TRAIL_SIDES = 6  # of the tube that is drawn along a path
 TRAIL_POINTS = 600  # at most, per path
 TRAIL_RADIUS = 0.004  # of the tube, relative to the robot
 # What page.html adds to the radius, relative to the distance from which it is seen. Where both
 # paths coincide the executed one covers the plan's.
 EXECUTED_WIDTH, PLAN_WIDTH = 0.0015, 0.0011
-FRAMED_POINTS = 60  # of each path that the camera makes sure to show
 GRID_LINES = 5  # at least, across all that is seen
-PLANAR = 1e-6  # m, sideways movement of a planar motion
 IDENTIFIER = re.compile(rb"[0-9a-f]{8}-[0-9a-f]{4}-1[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}")
 STILL = 1e-6  # m or quaternion units: what moves less is not animated
+JUMP = 1e-4  # s, in which a scale changes from one value to the next
 
 
 class Recorder:
@@ -94,55 +96,6 @@ class Recorder:
         ]
 
 
-@dataclass(frozen=True, eq=False)
-class Actor:
-    """A robot that moves through the scene.
-
-    Attributes:
-        name: its label and its node in meshcat's tree.
-        qpos: generalised positions, shape (T, nq).
-        timestep: seconds between them.
-        colour: of its label and its path, red, green, blue in [0, 1].
-        note: what the legend says of it.
-        ghost: translucent in its colour rather than solid in the model's colours; its path is
-            there from the beginning rather than drawn as it goes.
-    """
-
-    name: str
-    qpos: ArrayLike
-    timestep: float
-    colour: tuple[float, float, float]
-    note: str
-    ghost: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """An actor's motion, thinned to what can be seen.
-
-    Attributes:
-        times: seconds, shape (K,).
-        positions: of all bodies in the world in metres, shape (K, nbody, 3).
-        quaternions: (w, x, y, z), shape (K, nbody, 4).
-    """
-
-    times: Array
-    positions: Array
-    quaternions: Array
-
-
-def track(model: mujoco.MjModel, actor: Actor) -> Track:
-    """Where the bodies of an actor are, at most 60 times a second and always at the end."""
-    if not (math.isfinite(actor.timestep) and actor.timestep > 0.0):
-        raise TsbenchError(f"the time step of the {actor.name} motion is {actor.timestep}")
-    qpos = np.atleast_1d(np.asarray(actor.qpos, float))
-    stride = max(1, int(1.0 / (KEYFRAMES_PER_SECOND * actor.timestep) + 1e-9))
-    frames = np.arange(len(qpos))
-    kept = np.union1d(frames[::stride], frames[-1:])
-    times = np.asarray(kept * actor.timestep, np.float64)
-    return Track(times, *scene.body_poses(model, qpos[kept], actor.name))
-
-
 class Playback:
     """meshcat's command that animates nodes, with typed arrays instead of a map per keyframe."""
 
@@ -150,19 +103,32 @@ class Playback:
         self.duration = duration
         self.clips: list[dict[str, Any]] = []
 
-    def move(self, path: str, times: Array, position: Array, quaternion: Array) -> None:
-        """Animates one node: position (K, 3) and quaternion (w, x, y, z) (K, 4) at K times."""
+    def move(
+        self,
+        path: str,
+        times: Array,
+        position: Array,
+        quaternion: Array,
+        scale: Array | None = None,
+    ) -> None:
+        """Animates one node: position (K, 3) and quaternion (w, x, y, z) (K, 4) at K times, and
+        from each time to the next scale (K, 3)."""
+        channels = [
+            (".position", "vector3", times, position),
+            (".quaternion", "quaternion", times, np.roll(quaternion, -1, axis=-1)),
+        ]
+        if scale is not None:
+            until = np.repeat(times, 2)[1:]
+            until[1::2] -= JUMP
+            channels.append((".scale", "vector3", until, np.repeat(scale, 2, axis=0)[:-1]))
         tracks = [
             {
                 "name": name,
                 "type": kind,
-                "times": scene.packed(times),
+                "times": scene.packed(moments),
                 "values": scene.packed(values),
             }
-            for name, kind, values in (
-                (".position", "vector3", position),
-                (".quaternion", "quaternion", np.roll(quaternion, -1, axis=-1)),
-            )
+            for name, kind, moments, values in channels
             if np.ptp(values, axis=0).max() > STILL
         ]
         if tracks:
@@ -212,106 +178,6 @@ def trail(points: Array, radius: float) -> tuple[shapes.Geometry, NDArray[np.int
     return tube, kept
 
 
-@dataclass(frozen=True)
-class Landmark:
-    """A goal or an obstacle: a geom or site of that name, in world metres."""
-
-    text: str
-    position: tuple[float, float, float]
-    radius: float
-    colour: Colour
-
-
-def landmarks(model: mujoco.MjModel) -> list[Landmark]:
-    """What tasks add to a model under the names `goal` and `obstacle_1`, `obstacle_2`, ..."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    found = []
-    for part in scene.parts(model):
-        kind, name = part.name.split(" ", 1)
-        if re.fullmatch(r"goal|obstacle_\d+", name):
-            x, y, z = getattr(data, kind)(name).xpos.tolist()
-            size = float(np.max(getattr(model, kind)(name).size))
-            found.append(Landmark(name.replace("_", " "), (x, y, z), size, part.rgba))
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class Framing:
-    """What the camera is to show, in world metres.
-
-    Attributes:
-        size: how far the visible robot reaches around its base, the first body that can move.
-        above, below: the same upwards and downwards alone, about.
-        centres: of spheres to be seen, along the paths and at the landmarks, shape (S, 3).
-        radii: of the spheres, shape (S,).
-        direction: towards the camera.
-        flat: whether all happens in a vertical plane along x, with no ground to see it on.
-    """
-
-    size: float
-    above: float
-    below: float
-    centres: Array
-    radii: Array
-    direction: tuple[float, float, float]
-    flat: bool
-
-    @property
-    def box(self) -> tuple[Array, Array]:
-        """Lowest and highest corner of the box around the spheres."""
-        radii = self.radii[:, None]
-        return (self.centres - radii).min(axis=0), (self.centres + radii).max(axis=0)
-
-    @property
-    def extent(self) -> float:
-        """The diagonal of the box."""
-        low, high = self.box
-        return float(np.linalg.norm(high - low))
-
-
-def framing(
-    model: mujoco.MjModel, start: Array, tracks: Sequence[Track], marks: Sequence[Landmark]
-) -> Framing:
-    """How to look at a motion: so that it goes from left to right.
-
-    A motion within a vertical plane along x is looked at from the side, any other from the right,
-    ahead and above.
-
-    Args:
-        model: compiled model.
-        start: generalised positions at which the robot is measured, shape (nq,).
-        tracks: the motions, the most important one first.
-        marks: goal and obstacles.
-    """
-    data = mujoco.MjData(model)
-    data.qpos[:] = start
-    mujoco.mj_kinematics(model, data)
-    bodies = scene.moving_bodies(model)
-    robot = (model.geom_group < scene.VISIBLE_GROUPS) & (model.body_weldid[model.geom_bodyid] != 0)
-    around = data.geom_xpos[robot] - data.xpos[bodies[0]]
-    reach = np.linalg.norm(around, axis=1) + model.geom_rbound[robot]
-    size = float(np.max(reach, initial=0.0)) or float(model.stat.extent)
-    above = 0.1 * size + float(np.max(around[:, 2], initial=0.0))
-    below = 0.1 * size - float(np.min(around[:, 2], initial=0.0))
-
-    paths = [motion.positions[:, bodies[0]] for motion in tracks]
-    shown = [path[np.linspace(0, len(path) - 1, FRAMED_POINTS).astype(int)] for path in paths]
-    centres = np.concatenate([*shown, np.reshape([mark.position for mark in marks], (-1, 3))])
-    radii = np.full(len(centres), size)
-    radii[len(centres) - len(marks) :] = [mark.radius for mark in marks]
-
-    grounded = bool(np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE))
-    flat = bool(np.ptp(tracks[0].positions[:, bodies, 1], axis=0).max() < PLANAR)
-    x, y = (paths[0][-1] - paths[0][0])[:2]
-    distance = math.hypot(x, y)
-    x, y = (x / distance, y / distance) if distance > size else (1.0, 0.0)
-    direction = (0.3 * x + y, 0.3 * y - x, 0.35)
-    if flat:
-        direction = (0.0, -1.0, 0.2 if grounded else 0.0)
-    return Framing(size, above, below, centres, radii, direction, flat and not grounded)
-
-
 def metric_grid(view: Framing) -> tuple[shapes.LineSegments, list[dict[str, Any]]]:
     """Lines in round metres behind a flat motion, and the labels along two edges."""
     low, high = view.box
@@ -339,26 +205,39 @@ def metric_grid(view: Framing) -> tuple[shapes.LineSegments, list[dict[str, Any]
 # The page
 
 
-def _css(colour: Sequence[float]) -> str:
+def css(colour: Sequence[float]) -> str:
+    """A colour as style sheets have it."""
     return f"#{scene.hexadecimal(colour):06x}"
 
 
-def _legend(actors: Sequence[Actor], marks: Sequence[Landmark]) -> Iterator[str]:
-    entries = [(actor.name, actor.colour, actor.note) for actor in actors]
+def _entries(show: Show) -> Iterator[Entry]:
+    yield from (Entry(actor.name, actor.colour, actor.note) for actor in show.actors)
     for kind, note in (("goal", "where to go"), ("obstacle", "what to keep clear of")):
-        entries += [(kind, m.colour[:3], note) for m in marks if m.text.startswith(kind)][:1]
-    for name, colour, note in entries:
-        swatch = f'style="--swatch: {_css(colour)}"'
-        yield f"<li {swatch}><b>{html.escape(name)}</b>: {html.escape(note)}</li>"
+        marks = [mark for mark in show.landmarks if mark.text.startswith(kind)]
+        yield from (Entry(kind, mark.colour[:3], note) for mark in marks[:1])
+    yield from show.legend
+
+
+def _legend(show: Show) -> Iterator[str]:
+    for entry in _entries(show):
+        swatch = f'style="--swatch: {css(entry.colour)}"'
+        yield f"<li {swatch}><b>{html.escape(entry.name)}</b>: {html.escape(entry.note)}</li>"
 
 
 def _viewer_file(name: str) -> str:
     return Path(meshcat.viewer_assets_path(), name).read_text("utf-8")
 
 
-def _fill(template: str, contents: dict[str, str]) -> str:
-    """The template with `{{name}}` replaced, in one pass: contents are not searched again."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: contents[match[1]], template)
+def fill(template: str, contents: dict[str, str]) -> str:
+    """A template of this package with `{{name}}` replaced, in one pass: contents are not searched
+    again."""
+    text = importlib.resources.files("tsbench.viewer").joinpath(template).read_text("utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: contents[match[1]], text)
+
+
+def embedded(data: Any) -> str:
+    """JSON for a script element, which "<" could end."""
+    return json.dumps(data).replace("<", "\\u003c")
 
 
 def _rows(summary: Sequence[tuple[str, str]]) -> Iterator[str]:
@@ -385,30 +264,27 @@ def _send_actor(
     view: Framing,
 ) -> dict[str, Any]:
     """Sends a robot, its path and its animation; returns what the player is told of them."""
+    own = actor.name.replace("/", ":")  # "/" parts meshcat's paths
     robot = [part for part in scene.parts(model) if part.body != 0]
-    scene.draw(
-        root[actor.name], model, robot, (*actor.colour, GHOST_OPACITY) if actor.ghost else None
-    )
+    scene.draw(root[own], model, robot, (*actor.colour, GHOST_OPACITY) if actor.ghost else None)
     bodies = scene.moving_bodies(model)
     for body in bodies:
         name = scene.node(model, body)
         position, quaternion = motion.positions[:, body], motion.quaternions[:, body]
-        rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, quaternion[0])
-        root[actor.name][name].set_transform(scene.frame(position[0], rotation))
-        playback.move(f"meshcat/{actor.name}/{name}", motion.times, position, quaternion)
+        root[own][name].set_transform(scene.placed(position[0], quaternion[0]))
+        playback.move(f"meshcat/{own}/{name}", motion.times, position, quaternion)
     tube, kept = trail(motion.positions[:, bodies[0]], TRAIL_RADIUS * view.size)
     ink = shapes.MeshBasicMaterial(color=scene.hexadecimal(actor.colour))
-    root["path"][actor.name].set_object(tube, ink)
+    root["path"][own].set_object(tube, ink)
     return {
         "text": actor.name,
-        "colour": _css(actor.colour),
-        "node": f"meshcat/{actor.name}",
-        "base": f"meshcat/{actor.name}/{scene.node(model, bodies[0])}",
+        "colour": css(actor.colour),
+        "node": f"meshcat/{own}",
+        "base": f"meshcat/{own}/{scene.node(model, bodies[0])}",
         "ghost": actor.ghost,
         "rise": -view.below if actor.ghost else view.above,
         "trail": {
-            "node": f"meshcat/path/{actor.name}/<object>",
+            "node": f"meshcat/path/{own}/<object>",
             "times": np.where(actor.ghost, 0.0, motion.times[kept]).tolist(),
             "width": PLAN_WIDTH if actor.ghost else EXECUTED_WIDTH,
             "indices": 6 * TRAIL_SIDES,  # of triangles, from one time to the next
@@ -416,31 +292,55 @@ def _send_actor(
     }
 
 
-def render(
-    model: mujoco.MjModel,
-    actors: Sequence[Actor],
-    title: str,
-    summary: Sequence[tuple[str, str]],
-) -> str:
+def _send_prop(root: Visualizer, prop: Prop, playback: Playback) -> None:
+    """Sends a prop and its animation; one that is never to be seen is left out."""
+    if not prop.scale.any():
+        return
+    still = np.ptp(prop.scale, axis=0).max() <= STILL
+    place = root["props"][prop.name]
+    scene.draw_shape(place["shape"], prop.geom, prop.size, prop.colour)
+    # A scale that changes is the animation's: a matrix with a zero in it has no orientation.
+    first = prop.scale[0] if still else np.ones(3)
+    place.set_transform(scene.placed(prop.position[0], prop.quaternion[0]) @ np.diag([*first, 1]))
+    path = f"meshcat/props/{prop.name}"
+    playback.move(path, prop.times, prop.position, prop.quaternion, prop.scale)
+
+
+def _timeline(rows: Sequence[Band | Curve]) -> Iterator[dict[str, Any]]:
+    """Rows as the player draws them; numbers to four digits."""
+    for row in rows:
+        if isinstance(row, Band):
+            yield {"text": row.text, "planned": row.planned, "executed": row.executed}
+        else:
+            lines = [
+                {
+                    "colour": css(colour),
+                    "times": [round(float(t), 3) for t in times],
+                    "values": [float(f"{value:.4g}") for value in values],
+                }
+                for colour, times, values in row.lines
+            ]
+            yield {"text": row.text, "lines": lines}
+
+
+def render(show: Show, *, served: bool = False) -> str:
     """The page's text.
 
     Args:
-        model: with goal and obstacles in it.
-        actors: who moves; the camera follows the first.
-        title: what was run.
-        summary: labels and values of the score.
+        show: what is to be seen.
+        served: whether a server is there that can play the episode again with a push.
 
     Raises:
-        TsbenchError: a motion is not one of this model, or nothing in the model can move.
+        TsbenchError: a motion is not one of the show's model, or nothing in it can move.
     """
+    model, actors = show.model, show.actors
     if not scene.moving_bodies(model):
         raise TsbenchError("nothing in this model can move")
     tracks = [track(model, actor) for actor in actors]
-    marks = landmarks(model)
-    view = framing(model, np.asarray(actors[0].qpos, float)[0], tracks, marks)
+    view = framing(model, np.asarray(actors[0].qpos, float)[0], tracks, show.landmarks)
     labels: list[dict[str, Any]] = [
-        {"text": m.text, "position": m.position, "rise": m.radius, "colour": _css(INK)}
-        for m in marks
+        {"text": m.text, "position": m.position, "rise": m.radius, "colour": css(INK)}
+        for m in show.landmarks
     ]
 
     recorder = Recorder()
@@ -455,6 +355,8 @@ def render(
         _send_actor(root, model, actor, motion, playback, view)
         for actor, motion in zip(actors, tracks, strict=True)
     ]
+    for prop in show.props:
+        _send_prop(root, prop, playback)
     if playback.clips:
         recorder.send(playback)
 
@@ -465,60 +367,36 @@ def render(
         "spheres": np.column_stack([view.centres, view.radii]).round(3).tolist(),
         "size": view.size,
         "direction": view.direction,
+        "flat": view.flat,
         "sky": "rgb({}, {}, {})".format(*SKY),
         "actors": cast,
         "labels": labels,
+        "timeline": list(_timeline(show.timeline)),
+        "colours": {"planned": css(PLAN_COLOUR), "executed": css(EXECUTED_COLOUR)},
+        "served": served,
     }
-    return _fill(
-        importlib.resources.files("tsbench.viewer").joinpath("page.html").read_text("utf-8"),
+    return fill(
+        "page.html",
         {
-            "title": html.escape(title),
-            "summary": "".join(_rows(summary)),
-            "legend": "".join(_legend(actors, marks)),
+            "title": html.escape(show.title),
+            "verdict": html.escape(show.verdict),
+            "summary": "".join(_rows(show.summary)),
+            "legend": "".join(_legend(show)),
             "licences": "".join(map(_viewer_file, LICENCES)),
             "meshcat": _viewer_file("dist/main.min.js"),
-            # "<" could end the script element that the data stand in.
-            "page": json.dumps(data).replace("<", "\\u003c"),
+            "page": embedded(data),
         },
     )
 
 
-def write_page(
-    path: Path | str,
-    model: mujoco.MjModel,
-    executed: ArrayLike,
-    timestep: float,
-    *,
-    ghost: ArrayLike | None = None,
-    ghost_timestep: float | None = None,
-    title: str,
-    summary: Sequence[tuple[str, str]] = (),
-    overwrite: bool = False,
-) -> None:
-    """Writes the page of one motion and, beside it, the plan that it was to follow.
-
-    Args:
-        path: the HTML file.
-        model: compiled model, with goal and obstacles in it.
-        executed: generalised positions of the executed motion, shape (T, nq).
-        timestep: seconds between them.
-        ghost: generalised positions of the plan, shape (T', nq).
-        ghost_timestep: seconds between them; `timestep` when None.
-        title: what was run.
-        summary: labels and values of the score.
-        overwrite: whether a file that is there may be replaced.
+def write(path: Path, text: str) -> None:
+    """Writes a page, a new one.
 
     Raises:
-        TsbenchError: the file exists or cannot be written, or a motion is not one of this model.
+        TsbenchError: the file exists or cannot be written.
     """
-    path = Path(path)
-    if path.exists() and not overwrite:
+    if path.exists():
         raise TsbenchError(f"{path} exists already; name another file or remove it")
-    actors = [Actor("executed", executed, timestep, EXECUTED_COLOUR, EXECUTED_NOTE)]
-    if ghost is not None:
-        step = timestep if ghost_timestep is None else ghost_timestep
-        actors.append(Actor("plan", ghost, step, PLAN_COLOUR, PLAN_NOTE, ghost=True))
-    text = render(model, actors, title, summary)
     try:
         write_whole(path, text.encode())
     except OSError as error:

@@ -57,6 +57,7 @@ class Part:
         closed: whether the shape has an inside that nobody sees.
         faceted: whether its faces are flat, so that light must not be smoothed over their edges.
         shine: specular reflection and shininess, MuJoCo's numbers in [0, 1].
+        glows: whether its colour is its own light, as a picture's is, which no lamp changes.
     """
 
     name: str
@@ -68,6 +69,7 @@ class Part:
     closed: bool
     faceted: bool
     shine: tuple[float, float]
+    glows: bool
 
 
 class Described(shapes.Geometry):
@@ -140,6 +142,15 @@ def _box(size: Array) -> Shape:
     return shapes.Box(2 * size), np.eye(3)
 
 
+def _arrow(size: Array) -> Shape:
+    """From the origin along z: of no model, but MuJoCo's way to draw forces."""
+    radius, length = size[:2]
+    head = min(3.0 * radius, 0.5 * length)
+    outline = [(0.0, 0.0), (radius, 0.0), (radius, length - head), (2 * radius, length - head)]
+    points = [{"x": x, "y": y} for x, y in (*outline, (0.0, length))]
+    return Described("LatheGeometry", points=points, segments=LATHE_SEGMENTS), UPRIGHT
+
+
 def _mesh(model: mujoco.MjModel, data: int) -> Shape:
     first, count = model.mesh_vertadr[data], model.mesh_vertnum[data]
     vertices = model.mesh_vert[first : first + count]
@@ -168,6 +179,7 @@ FROM_SIZE: dict[mujoco.mjtGeom, Callable[[Array], Shape]] = {
     GEOM.mjGEOM_ELLIPSOID: _ellipsoid,
     GEOM.mjGEOM_CYLINDER: _cylinder,
     GEOM.mjGEOM_BOX: _box,
+    GEOM.mjGEOM_ARROW: _arrow,
 }
 FROM_ASSET: dict[mujoco.mjtGeom, Callable[[mujoco.MjModel, int], Shape]] = {
     GEOM.mjGEOM_MESH: _mesh,
@@ -296,6 +308,7 @@ def parts(model: mujoco.MjModel, reach: float = 20.0) -> tuple[Part, ...]:
                     form not in OPEN_SHAPES,
                     form in FROM_ASSET,
                     (float(shine[0]), float(shine[1])),
+                    material >= 0 and bool(model.mat_emission[material] > 0.0),
                 )
             )
     return tuple(found)
@@ -326,22 +339,52 @@ def draw(
     for part in elements:
         *colour, opacity = tint or part.rgba
         specular, shininess = part.shine
-        material = shapes.MeshPhongMaterial(
+        kind = shapes.MeshBasicMaterial if part.glows else shapes.MeshPhongMaterial
+        light = {} if part.glows else {
+            "flatShading": part.faceted,
+            "specular": hexadecimal([0.4 * specular] * 3),
+            "shininess": 1.0 + 100.0 * shininess,
+        }  # fmt: skip
+        material = kind(
             color=0xFFFFFF if part.texture and not tint else hexadecimal(colour),
             map=None if tint else part.texture,
             opacity=opacity,
-            flatShading=part.faceted,
             side=FRONT_SIDE if part.closed else DOUBLE_SIDE,
-            specular=hexadecimal([0.4 * specular] * 3),
-            shininess=1.0 + 100.0 * shininess,
             # What is tinted gives way where it coincides with what is not.
             polygonOffset=tint is not None,
             polygonOffsetFactor=1,
             polygonOffsetUnits=1,
+            **light,
         )
         place = vis[node(model, part.body)][part.name]
         place.set_object(part.geometry, material)
         place.set_transform(part.transform)
+
+
+def draw_shape(
+    vis: Visualizer, geom: mujoco.mjtGeom, size: Sequence[float], colour: Colour
+) -> None:
+    """Sends one shape of a colour that no light changes, such as a mark.
+
+    Args:
+        vis: its node.
+        geom: one of those that have sizes, or an arrow of a radius and a length along z.
+        size: in metres, as in MJCF.
+        colour: with opacity.
+    """
+    geometry, shape = FROM_SIZE[geom](np.asarray(size, np.float64))
+    *rgb, opacity = colour
+    vis.set_object(
+        geometry, shapes.MeshBasicMaterial(color=hexadecimal(rgb), opacity=opacity, side=2)
+    )
+    vis.set_transform(frame(np.zeros(3), shape))
+
+
+def placed(position: Array, quaternion: Array) -> Array:
+    """Homogeneous transform of a position (3,) and a quaternion (w, x, y, z)."""
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    return frame(position, rotation)
 
 
 def moving_bodies(model: mujoco.MjModel) -> list[int]:

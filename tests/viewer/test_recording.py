@@ -1,0 +1,88 @@
+"""Recordings: what the physics did, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tsbench import tasks
+from tsbench.errors import TsbenchError
+from tsbench.evaluation.evaluate import evaluate
+from tsbench.motion import ReferenceMotion
+from tsbench.sim.episodes import PolicyFunction
+from tsbench.tasks.laikago import LaikagoState
+from tsbench.viewer.pushes import parse_push
+from tsbench.viewer.recording import record_episode, record_motion
+
+
+def steadily(*action: float) -> PolicyFunction:
+    return lambda observation: np.tile(action, (len(observation), 1))
+
+
+def test_an_episode_is_the_one_that_is_scored() -> None:
+    task = tasks.make("rocket_obstacles")
+    policy = steadily(0.7, 0.0)
+    recording = record_episode(task, policy)
+    score = evaluate(policy, task, episodes=1)
+    assert len(recording.times) == len(recording.states.time) == score.nominal.steps + 1
+    assert recording.goal_distance[-1] == score.nominal.goal_distance
+    earned = recording.reward_terms["reward"].sum() / (task.max_reward * task.horizon)
+    assert earned == pytest.approx(score.normalized_reward, rel=1e-12)
+    assert (recording.solved, recording.violated) == (False, False)
+    np.testing.assert_array_equal(recording.qpos[0], 0.0)
+    np.testing.assert_allclose(recording.controls, [(35.0, 0.0)] * len(recording.actions))
+
+
+def test_reward_terms_make_up_the_reward() -> None:
+    rocket = record_episode(tasks.make("rocket_obstacles"), steadily(0.7, 0.0)).reward_terms
+    assert list(rocket) == ["near the goal", "near obstacle 1", "near obstacle 2", "reward"]
+    np.testing.assert_allclose(
+        sum(values for name, values in rocket.items() if name != "reward"), rocket["reward"]
+    )
+    laikago = record_episode(tasks.make("laikago_trot"), steadily(*[0.0] * 12)).reward_terms
+    factors = [values for name, values in laikago.items() if name != "reward"]
+    assert len(factors) == 4
+    np.testing.assert_allclose(np.prod(factors, axis=0), laikago["reward"])
+
+
+def test_who_stands_still_is_held_where_his_mass_is() -> None:
+    """At rest all four feet press, their pressures balance the weight about the centre of mass."""
+    recording = record_episode(tasks.make("laikago_trot"), steadily(*[0.0] * 12))
+    support = recording.support
+    assert support.contacts[90:].all()
+    np.testing.assert_allclose(support.pressure[150:, :2], support.com[150:, :2], atol=1e-3)
+    np.testing.assert_allclose(support.pressure[150:, 2], 0.0, atol=2e-3)
+    assert support.feet.shape == (181, 4, 3)
+    assert isinstance(recording.states, LaikagoState)
+    np.testing.assert_array_equal(support.feet, recording.states.feet)
+
+
+def test_a_push_is_recorded_as_it_acted() -> None:
+    recording = record_episode(
+        tasks.make("laikago_trot"), steadily(*[0.0] * 12), parse_push("50N@0.5s:+y")
+    )
+    still = record_episode(tasks.make("laikago_trot"), steadily(*[0.0] * 12))
+    steps = np.flatnonzero(recording.forces.any(axis=(1, 2)))
+    np.testing.assert_array_equal(steps, [15, 16, 17])
+    body = recording.task.spec().compile().body(recording.task.pushed).id
+    np.testing.assert_allclose(recording.forces[15:18, body, :3], [(0.0, 50.0, 0.0)] * 3)
+    assert not still.forces.any()
+    np.testing.assert_array_equal(recording.qpos[:16], still.qpos[:16])
+    assert recording.qpos[18, 1] > still.qpos[18, 1] + 0.005  # the body went where it was pushed
+
+
+def test_a_motion_is_seen_as_the_task_sees_it(
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    task, motion = tasks.make("laikago_walk"), naive_reference("laikago_walk")
+    recording = record_motion(task, motion)
+    assert recording.duration == pytest.approx(motion.duration)
+    assert recording.goal_distance[0] == pytest.approx(1.584)
+    np.testing.assert_allclose(recording.support.feet, motion.feet, atol=1e-9)
+    assert recording.scheduled is not None
+    np.testing.assert_array_equal(recording.scheduled, motion.contacts)
+    assert recording.solved is None
+    with pytest.raises(TsbenchError, match="is for laikago_walk version 1, not for laikago_trot"):
+        record_motion(tasks.make("laikago_trot"), motion)

@@ -1,0 +1,78 @@
+"""The report: what it says is what was scored and recorded."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tsbench import cli
+from tsbench.errors import TsbenchError
+from tsbench.viewer import report
+
+MakeRun = Callable[..., Path]
+
+
+def words_of(text: str) -> str:
+    """The page's own text, without the view inside it."""
+    return re.sub(r'srcdoc="[^"]*"', "", text)
+
+
+def test_a_report_says_what_was_planned_and_done_and_how_good_it_is(make_run: MakeRun) -> None:
+    run = make_run("laikago_trot")
+    text = report.render(run)
+    assert len(text) < 3e6
+    own = words_of(text)
+    for words in (
+        "laikago_trot, twostage, seed 0, budget smoke",
+        "The plan starts 3.78 m from the goal",
+        "In full physics the policy ends 3.79 m from the goal after 6.0 s, which does not solve",
+        "It earns 12% of the reward",
+        "solves the task 0 times, and falls or collides 25 times",
+        "Foot contacts",
+        "feet do not slip",
+        "FR_thigh_joint, rad (typical error",
+        "share of pushes survived",
+        "environment steps",
+        "<td>1:01</td>",
+        "mean distance of CoM from support",
+        "How it learned",
+    ):
+        assert words in own, words
+    assert not re.search(r"https?://(?!www\.w3\.org)|\bsrc=|@import", own.replace("xlink:href", ""))
+
+
+def test_what_a_run_lacks_is_left_out(make_run: MakeRun) -> None:
+    run = make_run("rocket_navigation", 0.7)
+    for name in ("plan.npz", "reference.npz", "metrics.jsonl"):
+        (run / name).unlink()
+    record = json.loads((run / "score.json").read_text())
+    del record["score"]["robustness"]
+    (run / "score.json").write_text(json.dumps(record))
+    own = words_of(report.render(run))
+    assert "without a plan" in own
+    for words in ("Foot contacts", "Joints", "Robustness", "How it learned", "physics follow"):
+        assert words not in own
+
+
+def test_only_finished_runs_have_reports(make_run: MakeRun, tmp_path: Path) -> None:
+    run = make_run("rocket_navigation", 0.7)
+    (run / "score.json").unlink()
+    with pytest.raises(TsbenchError, match=r"has no score\.json: only a finished run"):
+        report.render(run)
+    with pytest.raises(TsbenchError, match="no run directory"):
+        report.render(tmp_path / "nowhere")
+
+
+def test_the_command_writes_it_beside_the_run(
+    make_run: MakeRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run("rocket_navigation", 0.7)
+    assert cli.main(["report", str(run)]) == 0
+    assert capsys.readouterr().out == f"{run / 'report.html'}\n"
+    assert (run / "report.html").read_text("utf-8").startswith("<!DOCTYPE html>")
+    assert cli.main(["report", str(run)]) == 2
+    assert "exists already" in capsys.readouterr().err

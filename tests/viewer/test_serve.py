@@ -1,0 +1,96 @@
+"""The live view: an address, a page, and the episode played again with a push."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tsbench.errors import TsbenchError
+from tsbench.viewer import serve
+
+
+def fetch(url: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(url, timeout=60) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def render(push: str | None) -> str:
+    if push == "bad":
+        raise TsbenchError("cannot read the push 'bad'")
+    return f"<p>{push}</p>"
+
+
+@contextmanager
+def running(render: serve.Render) -> Iterator[str]:
+    server = serve.server(render, 0)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield serve.address(server, None)
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def test_a_page_with_or_without_a_push() -> None:
+    with running(render) as url:
+        assert fetch(url) == (200, "<p>None</p>")
+        assert fetch(f"{url}?push=100N%400.5s%3A%2By") == (200, "<p>100N@0.5s:+y</p>")
+        assert fetch(f"{url}?push=bad") == (400, "cannot read the push 'bad'")
+        assert fetch(f"{url}favicon.ico")[0] == 404
+
+
+def test_a_page_is_made_once() -> None:
+    made: list[str | None] = []
+
+    def count(push: str | None) -> str:
+        made.append(push)
+        return "page"
+
+    with running(count) as url:
+        assert [fetch(url)[1], fetch(url)[1]] == ["page", "page"]
+    assert made == [None]
+
+
+def test_a_port_that_is_taken() -> None:
+    first = serve.server(render, 0)
+    port = first.server_address[1]
+    with first, pytest.raises(TsbenchError, match=f"cannot listen on port {port}: Address already"):
+        serve.server(render, port)
+
+
+def test_the_command_says_where_and_ends_at_ctrl_c(
+    make_run: Callable[..., Path], tmp_path: Path
+) -> None:
+    run = make_run("laikago_trot")
+    words = ["view", str(run), "--push", "60N@0.5s:+y"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "tsbench.cli", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.match(r"(http://127\.0\.0\.1:\d+/\?push=60N%400\.5s%3A%2By) \(Ctrl-C", line)
+        assert found, line
+        status, text = fetch(found[1])
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    assert (status, process.returncode, errors) == (200, 0, "")
+    assert "<b>push</b>" in text  # the legend
+    assert '"served": true' in text

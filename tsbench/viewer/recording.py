@@ -1,0 +1,224 @@
+"""What happened in an episode, or would along a plan: poses, forces, contacts, rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from tsbench.errors import TsbenchError
+from tsbench.evaluation.evaluate import check_fit
+from tsbench.mdp import Readings, S, State, Task
+from tsbench.motion import ReferenceMotion
+from tsbench.policy import Policy
+from tsbench.sim.batched import Physics
+from tsbench.sim.episodes import PolicyFunction, play
+from tsbench.sim.model import sensor_slices
+from tsbench.sim.push import Push
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """T steps of one robot.
+
+    Attributes:
+        task: whose physics and rewards these are.
+        qpos: generalised positions, shape (T + 1, nq).
+        qvel: generalised velocities, shape (T + 1, nv).
+        controls: of the actuators in each step, shape (T, nu).
+        forces: on each body in each step from outside, as MuJoCo's `xfrc_applied`: newtons at its
+            centre of mass, newton metres; world frame, shape (T, nbody, 6).
+        states: of the task, with time as the batch axis.
+        actions: shape (T, action_size).
+        solved: whether it counts as a success at its end; None along a plan.
+        violated: whether a fall or collision spoiled it.
+    """
+
+    task: Task[Any]
+    qpos: Array
+    qvel: Array
+    controls: Array
+    forces: Array
+    states: State
+    actions: Array
+    solved: bool | None
+    violated: bool
+
+    @property
+    def times(self) -> Array:
+        """Seconds, shape (T + 1,)."""
+        return np.asarray(np.arange(len(self.qpos)) * self.task.timestep, np.float64)
+
+    @property
+    def duration(self) -> float:
+        """Seconds."""
+        return float(self.times[-1])
+
+    @property
+    def goal_distance(self) -> Array:
+        """Metres, shape (T + 1,)."""
+        return np.asarray(self.task.goal_distance(self.states), np.float64)
+
+    @cached_property
+    def reward_terms(self) -> dict[str, Array]:
+        """The parts of each step's reward, and under "reward" the whole, each of shape (T,)."""
+        before, after = self.states.rows(slice(0, -1)), self.states.rows(slice(1, None))
+        terms = self.task.reward_terms(before, self.actions, after)
+        return {**terms, "reward": self.task.reward(before, self.actions, after)}
+
+    @cached_property
+    def scheduled(self) -> NDArray[np.bool_] | None:
+        """Whether each foot is to be on the ground, shape (T + 1, feet); None if nothing says."""
+        contacts = self.task.drawing().contacts
+        return None if contacts is None else np.asarray(contacts(self.times), bool)
+
+    @cached_property
+    def support(self) -> Support:
+        """How it stands on the ground."""
+        return _support(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """How a robot stands on the ground; world frame, metres.
+
+    Attributes:
+        feet: centres of `Drawing.feet`, shape (T + 1, feet, 3).
+        contacts: whether each foot presses on the ground, shape (T + 1, feet).
+        com: whole-body centre of mass, shape (T + 1, 3).
+        pressure: centre of pressure: the mean of all contact points with the ground, weighted
+            with their normal forces; not a number while there is none, shape (T + 1, 3).
+    """
+
+    feet: Array
+    contacts: NDArray[np.bool_]
+    com: Array
+    pressure: Array
+
+
+def record_episode(task: Task[Any], policy: PolicyFunction, push: Push | None = None) -> Recording:
+    """Plays one episode from the task's own start.
+
+    Args:
+        task: what to play.
+        policy: what plays it.
+        push: a force on the robot while it plays.
+
+    Raises:
+        TsbenchError: the policy is for another task, version or physics.
+    """
+    if isinstance(policy, Policy):
+        check_fit(policy, task)
+    physics: Physics[Any] = Physics(task, 1, push=push)
+    bound = [physics.batch.bind(name) for name in ("qpos", "qvel", "ctrl", "xfrc_applied")]
+    states: list[Any] = []
+
+    def record(state: Any) -> np.ndarray:
+        states.append(state)
+        return np.concatenate([array.reshape(1, -1) for array in bound], axis=1)
+
+    episode = play(task, physics, policy, 1, seed=0, record=record)
+    assert episode.states is not None
+    length = int(episode.lengths[0])
+    sizes = np.cumsum([array[0].size for array in bound])[:-1]
+    qpos, qvel, controls, forces = np.split(episode.states[: length + 1, 0], sizes, axis=1)
+    return Recording(
+        task=task,
+        qpos=qpos,
+        qvel=qvel,
+        controls=controls[1:],
+        forces=forces[1:].reshape(length, -1, 6),
+        states=joined(states),
+        actions=episode.actions[:length, 0],
+        solved=bool(task.success(episode.final)[0] and not episode.violated[0]),
+        violated=bool(episode.violated[0]),
+    )
+
+
+def record_motion(task: Task[Any], motion: ReferenceMotion) -> Recording:
+    """A motion as if the physics followed it exactly: no forces, no actions.
+
+    Raises:
+        TsbenchError: the motion is for another task or version, or at another rate.
+    """
+    if (motion.task, motion.task_version) != (task.name, task.version):
+        raise TsbenchError(
+            f"the reference motion is for {motion.task} version {motion.task_version}, "
+            f"not for {task.name} version {task.version}"
+        )
+    model = task.spec().compile()
+    data = mujoco.MjData(model)
+    if motion.qpos.shape[1] != model.nq or motion.qvel.shape[1] != model.nv:
+        raise TsbenchError(
+            f"the plan motion has shape {motion.qpos.shape}, this model needs (frames, {model.nq})"
+        )
+    sensors = np.zeros((len(motion.qpos), model.nsensordata))
+    for row, qpos, qvel in zip(sensors, motion.qpos, motion.qvel, strict=True):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(model, data)
+        row[:] = data.sensordata
+    memory = task.start(np.random.default_rng(0), 1).memory
+    states = task.read(
+        Readings(
+            time=np.arange(len(sensors)) * motion.timestep,
+            qpos=motion.qpos,
+            qvel=motion.qvel,
+            sensors={name: sensors[:, part] for name, part in sensor_slices(model).items()},
+            memory=np.repeat(memory, len(sensors), axis=0),
+        )
+    )
+    return Recording(
+        task=task,
+        qpos=motion.qpos,
+        qvel=motion.qvel,
+        controls=np.zeros((motion.steps, model.nu)),
+        forces=np.zeros((motion.steps, model.nbody, 6)),
+        states=states,
+        actions=np.zeros((motion.steps, task.action_size)),
+        solved=None,
+        violated=bool(np.any(task.violated(states))),
+    )
+
+
+def joined(states: Sequence[S]) -> S:
+    """States one after the other along the first batch axis."""
+    fields = vars(states[0])
+    return states[0].replace(
+        **{name: np.concatenate([getattr(state, name) for state in states]) for name in fields}
+    )
+
+
+def _support(recording: Recording) -> Support:
+    """The forces are those that MuJoCo finds for each state and the step that begins there."""
+    model = recording.task.spec().compile()
+    feet = [model.geom(name).id for name in recording.task.drawing().feet]
+    fixed = model.body_weldid[model.geom_bodyid] == 0  # of geoms: the ground
+    data = mujoco.MjData(model)
+    count = len(recording.qpos)
+    centres, contacts = np.zeros((count, len(feet), 3)), np.zeros((count, len(feet)), bool)
+    com, pressure = np.zeros((count, 3)), np.full((count, 3), np.nan)
+    wrench = np.zeros(6)
+    for frame in range(count):
+        step = min(frame, count - 2)
+        data.qpos[:], data.qvel[:] = recording.qpos[frame], recording.qvel[frame]
+        data.ctrl[:], data.xfrc_applied[:] = recording.controls[step], recording.forces[step]
+        mujoco.mj_forward(model, data)
+        centres[frame], com[frame] = data.geom_xpos[feet], data.subtree_com[0]
+        total, moment = 0.0, np.zeros(3)
+        for index in range(data.ncon):
+            contact = data.contact[index]
+            if not fixed[contact.geom].any():
+                continue
+            mujoco.mj_contactForce(model, data, index, wrench)
+            total, moment = total + wrench[0], moment + wrench[0] * contact.pos
+            contacts[frame] |= np.isin(feet, contact.geom) & (wrench[0] > 0.0)
+        if total > 0.0:
+            pressure[frame] = moment / total
+    return Support(centres, contacts, com, pressure)

@@ -1,0 +1,195 @@
+"""The report of a run: one page that says what was planned, what was executed, and how good it is.
+
+It needs nothing else to be opened: the 3-D view and all charts are inside.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tsbench import record, tables
+from tsbench.errors import TsbenchError
+from tsbench.motion import Plan
+from tsbench.viewer import charts, page
+from tsbench.viewer.compose import foot_bands
+from tsbench.viewer.recording import Recording, record_episode
+from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR
+from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words, run_subject
+
+Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
+
+
+def write_run_pages(directory: Path, score: Mapping[str, Any]) -> None:
+    """Writes a run's `view.html` and `report.html`, new files.
+
+    Args:
+        directory: of the run, with everything but its score in it.
+        score: what is to become `score.json`.
+
+    Raises:
+        TsbenchError: a file exists or cannot be written.
+    """
+    view, report = _pages(run_subject(directory, score), directory)
+    page.write(directory / record.PAGE, view)
+    page.write(directory / record.REPORT, report)
+
+
+def render(directory: Path) -> str:
+    """The report of a finished run.
+
+    Raises:
+        TsbenchError: the run is not finished, or a file in it is missing or damaged.
+    """
+    if directory.is_dir() and not (directory / record.SCORE).exists():
+        raise TsbenchError(f"{directory} has no {record.SCORE}: only a finished run has a report")
+    return _pages(run_subject(directory), directory)[1]
+
+
+def _pages(run: Subject, directory: Path) -> tuple[str, str]:
+    """The page with the 3-D view, and the report that has it inside."""
+    assert run.policy is not None
+    assert run.score is not None
+    plan, recording = run.plan(), record_episode(run.task, run.policy)
+    view = page.render(run.show_of(recording, plan))
+    report = page.fill(
+        "report.html",
+        {
+            "title": html.escape(run.title),
+            "plan": page.css(PLAN_COLOUR),
+            "executed": page.css(EXECUTED_COLOUR),
+            "answers": "".join(_answers(run.score, recording, plan)),
+            "view": html.escape(view),
+            "sections": "".join(_sections(run, directory, recording, plan)),
+        },
+    )
+    return view, report
+
+
+def _answers(
+    score: Mapping[str, Any], recording: Recording, plan: Recording | None
+) -> Iterator[str]:
+    planned = "Nothing: this method learns to act directly, without a plan."
+    if plan is not None:
+        planned = planned_in_words(plan) + " No physics binds it."
+    for kind, title, text in (
+        ("plan", "What was planned", planned),
+        ("executed", "What was executed", executed_in_words(recording)),
+        ("score", "How good it is", _worth_in_words(score["score"])),
+    ):
+        yield f'<section class="{kind}"><h2>{title}</h2><p>{html.escape(text)}</p></section>'
+
+
+def _worth_in_words(score: Mapping[str, Any]) -> str:
+    perturbed = score["perturbed"]
+    episodes = perturbed["episodes"]
+    solved, spoiled = (round(perturbed[name] * episodes) for name in ("success", "violations"))
+    return (
+        f"It earns {score['optimality']:.0%} of the reward of the best motion known under the "
+        f"planner's speed limits. From {episodes} starts a little different from the task's own "
+        f"it solves the task {solved} times, and falls or collides {spoiled} times."
+    )
+
+
+def _sections(
+    run: Subject, directory: Path, recording: Recording, plan: Recording | None
+) -> Iterator[str]:
+    assert run.score is not None
+    duration = max(r.duration for r in (recording, plan) if r is not None)
+    if recording.task.drawing().feet:
+        bands = foot_bands(plan or recording, recording)
+        yield _section(
+            "Foot contacts",
+            "Blue: when each foot was to stand on the ground. Orange: when it pressed on it, in "
+            f"full physics. {_agreement(recording)}",
+            charts.contacts(bands, duration),
+        )
+    yield _section(
+        "Reward of each step",
+        "What the task pays, and the terms that it is made of. Blue: what the plan would earn if "
+        "the robot could follow it exactly. Orange: what was executed.",
+        charts.rewards(recording, plan),
+    )
+    if plan is not None:
+        yield _section(
+            "Joints",
+            "Planned in blue, executed in orange; the typical error is the root of the mean "
+            "square, at equal times.",
+            charts.joints(recording, plan),
+        )
+    robustness = run.score["score"].get("robustness")
+    if robustness:
+        yield _section(
+            "Robustness",
+            "Pushes on the robot's body: which it survives without a fall.",
+            charts.robustness(robustness["surface"], run.task.timestep),
+        )
+    metrics = directory / record.METRICS
+    if learning := charts.learning(metrics) if metrics.exists() else None:
+        yield _section(
+            "How it learned",
+            "Return of the episodes during training, of each stage by the reward of that stage.",
+            learning,
+        )
+    yield _section(
+        "Numbers",
+        f"Everything in this page comes from {directory.name}/; the same score again: tsbench "
+        "evaluate. How the run was made is in config.yaml and versions.json.",
+        f'<div class="tables">{"".join(_tables(run, directory))}</div>',
+    )
+
+
+def _agreement(recording: Recording) -> str:
+    if recording.scheduled is None:
+        return ""
+    share = np.mean(recording.scheduled == recording.support.contacts)
+    return f"Both agree {share:.0%} of the time."
+
+
+def _tables(run: Subject, directory: Path) -> Iterator[str]:
+    assert run.score is not None
+    yield _table(_score_rows(run.score["score"]))
+    costs = [
+        (stage["name"], f"{stage['steps']:,}", f"{stage['physics_substeps']:,}",
+         tables.duration(stage["seconds"]))
+        for stage in run.score["stages"]
+    ]  # fmt: skip
+    yield _table([("stage", "environment steps", "physics steps", "time"), *costs])
+    path = directory / record.PLAN
+    if path.exists() and run.reference is not None:
+        audit = run.task.audit(Plan.load(path), run.reference)
+        items = [
+            (item.what, f"{item.value:.3g} {item.unit}", f"{item.limit:.3g} {item.unit}",
+             "ok" if item.passed else "too much")
+            for item in audit.items
+        ]  # fmt: skip
+        yield _table([("can physics follow the plan?", "measured", "allowed", ""), *items])
+
+
+def _score_rows(score: Mapping[str, Any]) -> Table:
+    own, perturbed = score["nominal"], score["perturbed"]
+    rows = [("score", "task's own start", f"{perturbed['episodes']} other starts")]
+    for name in own:
+        if name != "episodes":
+            label = name.replace("_", " ") + (", m" if name == "goal_distance" else "")
+            rows.append((label, tables.number(own[name]), tables.number(perturbed[name])))
+    rows.append(("optimality", tables.number(score["optimality"]), ""))
+    return rows
+
+
+def _table(rows: Table) -> str:
+    def line(cells: Sequence[str], kind: str) -> str:
+        bad = ' class="bad"' if cells[-1] == "too much" else ""
+        inside = "".join(f"<{kind}{bad}>{html.escape(cell)}</{kind}>" for cell in cells)
+        return f"<tr>{inside}</tr>"
+
+    head, *body = rows
+    return f"<table>{line(head, 'th')}{''.join(line(cells, 'td') for cells in body)}</table>"
+
+
+def _section(title: str, text: str, content: str) -> str:
+    return f"<section><h2>{title}</h2><p>{html.escape(text)}</p>{content}</section>"

@@ -1,0 +1,111 @@
+"""What stands still in a show: the task's model, its world's edge, the map of its reward."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+
+from tsbench.errors import TsbenchError
+from tsbench.mdp import Drawing
+from tsbench.viewer.framing import reach
+from tsbench.viewer.recording import Recording
+from tsbench.viewer.scene import Array, Colour
+from tsbench.viewer.show import INK, SKY
+
+MAP_PIXELS = 240  # along the longer side of a reward map
+
+
+def stage(recording: Recording, lane: float = 0.0) -> mujoco.MjModel:
+    """The task's model with its world's edge and reward map, and the goal once more in a lane."""
+    spec = recording.task.spec()
+    goal = spec.site("goal")
+    if lane and goal is not None:
+        spec.worldbody.add_site(
+            type=goal.type, pos=np.add(goal.pos, (0.0, lane, 0.0)), size=goal.size, rgba=goal.rgba
+        )
+    behind = 2.05 * reach(recording.task.spec().compile(), recording.qpos[0])[0]
+    furnish(spec, recording.task.drawing(), behind)
+    return spec.compile()
+
+
+def furnish(spec: mujoco.MjSpec, drawing: Drawing, behind: float) -> None:
+    """Adds the world's edge and the map of its reward to a model, as things to look at only.
+
+    A planner's roadmap would go here too: one more call of `_line` for each of its edges.
+
+    Args:
+        spec: of the task.
+        drawing: of the task.
+        behind: metres by which the map lies behind the motion.
+    """
+    if drawing.bounds is None:
+        return
+    low, high = drawing.bounds
+    across = int(np.argmin(high - low))
+    if across != 1:
+        raise TsbenchError("only worlds that are flat across y can be drawn with their bounds")
+    corners = [
+        np.array([x, low[1], z])
+        for x, z in ((low[0], low[2]), (high[0], low[2]), (high[0], high[2]), (low[0], high[2]))
+    ]
+    width = 0.0015 * float(np.linalg.norm(high - low))
+    for begin, end in zip(corners, corners[1:] + corners[:1], strict=True):
+        _line(spec, begin, end, width, (*INK, 1.0))
+    if drawing.worth is not None:
+        _reward_map(spec, drawing, behind)
+
+
+def _line(
+    spec: mujoco.MjSpec, begin: Array, end: Array, radius: float, colour: Colour
+) -> mujoco.MjsGeom:
+    return spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[*begin, *end],
+        size=[radius, 0.0, 0.0],
+        rgba=colour,
+        contype=0,
+        conaffinity=0,
+        group=2,
+    )
+
+
+def _reward_map(spec: mujoco.MjSpec, drawing: Drawing, behind: float) -> None:
+    """A picture behind the world: gold where being pays, red where it costs, else like the sky."""
+    assert drawing.bounds is not None
+    assert drawing.worth is not None
+    low, high = drawing.bounds
+    span = high - low
+    columns, rows = np.maximum(np.rint(MAP_PIXELS * span[[0, 2]] / span.max()), 2).astype(int)
+    x = low[0] + span[0] * (np.arange(columns) + 0.5) / columns
+    z = high[2] - span[2] * (np.arange(rows) + 0.5) / rows  # the image's first row is the top
+    grid = np.stack(np.broadcast_arrays(x[None], low[1], z[:, None]), axis=-1)
+    worth = drawing.worth(grid.reshape(-1, 3)).reshape(rows, columns, 1)
+    gain = np.maximum(worth, 0.0) / max(float(worth.max()), 1e-9)
+    loss = np.maximum(-worth, 0.0) / max(float(-worth.min()), 1e-9)
+    image = np.array(SKY) + gain * ((255, 190, 20) - np.array(SKY))
+    image += loss * ((190, 70, 60) - image)
+    texture = spec.add_texture(
+        name="worth",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=int(columns),
+        height=int(rows),
+        nchannel=3,
+    )
+    texture.data = image.round().astype(np.uint8).tobytes()
+    material = spec.add_material(name="worth", specular=0.0, emission=0.4)
+    textures = material.textures
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "worth"
+    material.textures = textures
+    spec.worldbody.add_geom(
+        name="worth",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[span[0] / 2, span[2] / 2, 1.0],
+        pos=[(low[0] + high[0]) / 2, low[1] + behind, (low[2] + high[2]) / 2],
+        quat=[math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0],  # x to the right, y up
+        material="worth",
+        contype=0,
+        conaffinity=0,
+        group=2,
+    )

@@ -1,0 +1,155 @@
+"""What can be looked at: a run, a plan, a task, or two runs beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from tsbench import record, tables, tasks
+from tsbench.errors import TsbenchError
+from tsbench.mdp import Task
+from tsbench.motion import Plan, ReferenceMotion, read_motion
+from tsbench.policy import Policy
+from tsbench.sim.kinematic import naive_plan
+from tsbench.sim.push import Push
+from tsbench.viewer.compose import compose, compose_pair, compose_plan
+from tsbench.viewer.recording import Recording, record_episode, record_motion
+from tsbench.viewer.show import Show
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A task, with what was planned and learned for it.
+
+    Attributes:
+        title: what it is.
+        task: that it is about.
+        policy: what executes it, if there is one.
+        reference: the plan as full poses, if there is one. One of the two there is.
+        score: the content of `score.json`, if there is one.
+    """
+
+    title: str
+    task: Task[Any]
+    policy: Policy | None
+    reference: ReferenceMotion | None
+    score: Mapping[str, Any] | None = None
+
+    def plan(self) -> Recording | None:
+        return None if self.reference is None else record_motion(self.task, self.reference)
+
+    def show(self, push: Push | None = None) -> Show:
+        """
+        Raises:
+            TsbenchError: a push on what no policy holds up, or a policy for another task.
+        """
+        plan = self.plan()
+        if self.policy is None:
+            if push is not None:
+                raise TsbenchError("only what a policy executes can be pushed, not a plan")
+            assert plan is not None
+            return compose_plan(plan, title=self.title, verdict=planned_in_words(plan))
+        return self.show_of(record_episode(self.task, self.policy, push), plan)
+
+    def show_of(self, recording: Recording, plan: Recording | None) -> Show:
+        """What was executed beside what was planned."""
+        sentences = [] if plan is None else [planned_in_words(plan)]
+        return compose(
+            recording,
+            plan,
+            title=self.title,
+            verdict=" ".join([*sentences, executed_in_words(recording)]),
+            summary=tables.summary(self.score) if self.score else (),
+        )
+
+
+def subject(word: str) -> Subject:
+    """What a word of the command line names: task=NAME, a run's directory, or a plan's file.
+
+    Raises:
+        TsbenchError: it names nothing, or what is there is damaged.
+    """
+    if word.startswith("task="):
+        return task_subject(tasks.make(word.removeprefix("task=")))
+    path = Path(word)
+    return run_subject(path) if path.is_dir() or not path.exists() else plan_subject(path)
+
+
+def task_subject(task: Task[Any]) -> Subject:
+    """A task, shown by the plan that its hand-made planner makes."""
+    title = f"{task.name}, planned by hand"
+    return Subject(title, task, None, task.reference(naive_plan(task)))
+
+
+def run_subject(directory: Path, score: Mapping[str, Any] | None = None) -> Subject:
+    """A run.
+
+    Args:
+        directory: of the run; nothing but the policy must be in it.
+        score: what its `score.json` is to say, None for what it says.
+
+    Raises:
+        TsbenchError: there is no such directory, or a file in it is missing or damaged.
+    """
+    policy, task = record.read_policy(directory)
+    if score is None and (directory / record.SCORE).exists():
+        score = record.read_score(directory)
+    reference = directory / record.REFERENCE
+    return Subject(
+        title=tables.run_title(score) if score else task.name,
+        task=task,
+        policy=policy,
+        reference=ReferenceMotion.load(reference) if reference.exists() else None,
+        score=score,
+    )
+
+
+def plan_subject(path: Path) -> Subject:
+    """A plan or reference motion, with the constants of the run in whose directory it lies.
+
+    Raises:
+        TsbenchError: the file is neither, or damaged.
+    """
+    motion = read_motion(path)
+    constants = {}
+    if (path.parent / record.CONFIG).exists():
+        constants = record.read_config(path.parent).task.constants
+    task = tasks.make(motion.task, **constants)
+    if isinstance(motion, Plan):
+        motion = task.reference(motion)
+    return Subject(f"{task.name}, {path.name}", task, None, motion)
+
+
+def pair(runs: Sequence[str], push: Push | None = None) -> Show:
+    """Two runs of one task beside each other.
+
+    Raises:
+        TsbenchError: they are for different tasks, or one of them is damaged.
+    """
+    subjects = [run_subject(Path(word)) for word in runs]
+    recordings = [record_episode(s.task, cast(Policy, s.policy), push) for s in subjects]
+    verdict = " ".join(
+        f"{name} is {word}. {executed_in_words(recording)}"
+        for name, word, recording in zip("AB", runs, recordings, strict=True)
+    )
+    title = f"{subjects[0].task.name}: two policies"
+    a, b = recordings
+    return compose_pair(a, b, title=title, verdict=verdict)
+
+
+def planned_in_words(plan: Recording) -> str:
+    distance = plan.goal_distance
+    return (
+        f"The plan starts {distance[0]:.2f} m from the goal and ends {distance[-1]:.2f} m from it "
+        f"after {plan.duration:.1f} s."
+    )
+
+
+def executed_in_words(recording: Recording) -> str:
+    end = f"{recording.goal_distance[-1]:.2f} m from the goal after {recording.duration:.1f} s"
+    if recording.violated:
+        return f"In full physics the policy falls or collides on the way; it ends {end}."
+    verdict = "which solves the task" if recording.solved else "which does not solve the task"
+    return f"In full physics the policy ends {end}, {verdict}."
