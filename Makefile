@@ -15,6 +15,7 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
+EXTRAS := $(VENV)/.extras
 PYTHON ?= $(firstword $(foreach name,python3.12 python3.11 python3,\
 	$(shell $(name) -c 'import sys; (3, 11) <= sys.version_info < (3, 13) and print("$(name)")' 2>/dev/null)))
 ARGS ?=
@@ -43,6 +44,11 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
+# What the benchmark compares with, which a run does not need.
+$(EXTRAS): $(STAMP)
+	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev,bench]'
+	@touch $@
+
 run: setup
 	@$(BIN)/tsbench run $(words) $(ARGS)
 
@@ -50,10 +56,10 @@ run: setup
 system:
 	@.ci/debian libosmesa6 chromium
 
-test: setup system
+test: setup system $(EXTRAS)
 	$(BIN)/python -m pytest --numprocesses=auto $(ARGS)
 
-check: setup
+check: setup $(EXTRAS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -66,7 +72,7 @@ N ?= 50
 faults: setup
 	$(BIN)/python tests/faults.py --kills $(N) $(ARGS)
 
-bench: setup
+bench: setup $(EXTRAS)
 	@$(BIN)/tsbench bench $(ARGS)
 
 clean:

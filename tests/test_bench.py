@@ -1,43 +1,130 @@
+"""The benchmark, run small: that it does what it says, not how fast."""
+
 from __future__ import annotations
 
 import json
+from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tsbench import bench, tasks
+from tsbench.bench import Comparison, Findings, sb3, stepping
+from tsbench.bench.training import split
+from tsbench.bench.turns import Case, Effort, Range, take_turns
 from tsbench.cli import main
 from tsbench.errors import TsbenchError
 
+TINY = Effort(repeats=2, seconds=0.01, count=6, counts=(1, 3), iterations=1, budget="smoke")
+PARTS = ("physics", "mdp", "inference", "update", "records")
+
 
 @pytest.fixture(autouse=True)
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "QUICK_REPEATS", 2)
-    monkeypatch.setattr(bench, "QUICK_SECONDS", 0.01)
-    monkeypatch.setattr(bench, "COUNT", 8)
-    monkeypatch.setattr(bench, "RECORDED", 4)
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("QUICK", "FULL"):
+        monkeypatch.setattr(bench, name, TINY)
+    monkeypatch.setattr(stepping, "RECORDED", 3)
+    monkeypatch.setattr(sb3, "PATIENCE", 0.0)
+    monkeypatch.setattr(sb3, "PROCESSES", 2)
 
 
-def test_ratios_are_those_of_the_medians(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", bench.names())
+def test_every_comparison(name: str) -> None:
+    """Those whose packages are missing say so; the others measure something."""
+    findings = bench.measure(name, quick=True)
+    missing = [m for m in bench.find(name).requires if find_spec(m) is None]
+    assert bool(findings.figures) != bool(missing)
+    assert bool(findings.ratios) != bool(missing)
+    for value in (*findings.figures.values(), *findings.ratios.values()):
+        assert value.least <= value.median <= value.most
+    assert all(value.median > 0.0 for value in findings.figures.values())
+    for stage in {key.rpartition(".")[0] for key in findings.ratios if key.endswith("/whole")}:
+        shares = [findings.ratios[f"{stage}.{part}/whole"].median for part in PARTS]
+        assert sum(shares) == pytest.approx(1.0)
+        assert (shares[0] > 0.0) == stage.endswith("imitate")  # planning has no physics
+
+
+def test_what_is_written_is_what_was_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "bench.json"
     assert main(["bench", "--quick", "--only", "rocket", "--json", str(file)]) == 0
     result = json.loads(file.read_text())
-    rates = {name: rate["median"] for name, rate in result["rates"].items()}
-    assert set(rates) == {f"rocket.{case}" for case in ("batched", "rollout", "planning", "loop")}
-    for ratio, value in result["ratios"].items():
-        over, under = ratio.removeprefix("rocket.").split("/")
-        assert value == pytest.approx(rates[f"rocket.{over}"] / rates[f"rocket.{under}"])
-    for rate in result["rates"].values():
-        assert 0.0 < rate["least"] <= rate["median"] <= rate["most"]
+    assert {"rocket.batched/rollout", "rocket.batched/async"} <= result["ratios"].keys()
+    for name, (least, most) in result["ranges"].items():
+        assert least <= result["ratios"][name] <= most
+    assert result["figures"]["rocket.loop"]["unit"] == "steps/s"
+    assert result["machine"]["cores"] >= 1
+    shown = capsys.readouterr().out
+    assert "rocket.batched/rollout" in shown
+    assert result["machine"]["mujoco"] in shown
 
 
-def test_every_case_says_how_many_steps_it_did() -> None:
-    task = tasks.make("laikago_trot")
-    for make in (bench.batched, bench.rollout, bench.planning):
-        assert make(task, 8).steps() == 8
-    assert bench.loop(task).steps() == 16
+def test_a_missing_package_is_named_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = Findings(figures={"a": Range.of([1.0])})
+    table = {
+        "first": Comparison(lambda _: one, requires=("no_such_module",), named=False),
+        "second": Comparison(lambda _: one, requires=("numpy",), named=False),
+        "third": Comparison(lambda _: pytest.fail("was not named"), requires=(), named=True),
+    }
+    monkeypatch.setattr(bench, "_comparisons", table)
+    monkeypatch.setattr(bench, "names", lambda: tuple(table))
+    told: list[str] = []
+    findings = bench.measure(tell=told.append)
+    assert findings.notes == [
+        "first: not measured, lacks no_such_module (pip install 'tsbench[bench]')"
+    ]
+    assert told == ["second"]
+    assert findings.figures == one.figures
 
 
-def test_unknown_domain_is_refused() -> None:
+def test_unknown_comparison_is_refused() -> None:
     with pytest.raises(TsbenchError, match="did you mean 'rocket'"):
-        bench.measure(only="rockt")
+        bench.measure("rockt")
+
+
+def test_cases_say_how_many_steps_they_did() -> None:
+    task = tasks.make("laikago_trot")
+    assert stepping.batched("batched", task, 6).steps() == 6
+    assert stepping.rollout(task, 6).steps() == 6
+    assert stepping.loop("loop", task).steps() == stepping.SINGLE_STEPS
+
+
+def test_turns_are_taken_in_order_and_cases_closed() -> None:
+    told: list[str] = []
+
+    def case(name: str) -> Case:
+        def steps() -> int:
+            told.append(name)
+            return 4
+
+        return Case(name, steps, lambda: told.append(f"{name} closed"))
+
+    rates = take_turns([case("a"), case("b")], Effort(2, 0.0, 1, (1,), 1, "smoke"))
+    assert told[:2] == ["a", "b"]  # to allocate
+    assert told[-2:] == ["a closed", "b closed"]
+    assert rates.turns["a"].shape == (2,)
+    expected = rates.turns["a"] / rates.turns["b"]
+    assert rates.ratio("a", "b") == Range(np.median(expected), min(expected), max(expected))
+
+
+def test_a_training_is_split_without_rest() -> None:
+    """Iterations of 10 s and 20 s: 4 and 12 of physics, 1 and 2 of MDP math and so on."""
+    times = {
+        "seconds": (0.0, 10.0, 30.0),
+        "collect_seconds": (99.0, 6.0, 16.0),
+        "update_seconds": (99.0, 3.0, 3.0),
+        "environment_seconds": (99.0, 5.0, 14.0),
+        "physics_seconds": (99.0, 4.0, 12.0),
+    }
+    rows = [{name: values[i] for name, values in times.items()} for i in range(3)]
+    findings = split("x", rows, 100)
+    assert findings.figures == {"x": Range(7.5, 5.0, 10.0, "steps/s")}
+    expected = {
+        "physics": (0.4, 0.6), "mdp": (0.1, 0.1), "inference": (0.1, 0.1),
+        "update": (0.15, 0.3), "records": (0.05, 0.1),
+    }  # fmt: skip
+    for part, (least, most) in expected.items():
+        found = findings.ratios[f"x.{part}/whole"]
+        assert (found.least, found.most) == pytest.approx((least, most))

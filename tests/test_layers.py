@@ -37,26 +37,30 @@ MAY_KNOW: dict[str, set[str]] = {
     "rl": {"errors", "typed", "mdp", "policy", "problem", "sim"},
     "methods": {"errors", "typed", "motion", "mdp", "policy", "problem", "sim", "planning", "rl"},
     "viewer": {
-        "errors", "files", "motion", "mdp", "policy", "sim", "tasks", "evaluation", "record", "tables",
-        "curves",
+        "errors", "files", "motion", "mdp", "policy", "sim", "tasks", "evaluation", "record",
+        "tables", "curves",
     },
     "config": {"errors", "typed", "problem"},
     "record": {"errors", "files", "typed", "motion", "mdp", "policy", "tasks", "config"},
-    "bench": {"errors", "mdp", "sim", "tasks"},
-    "tables": {"record", "bench"},
+    "tables": {"record"},
     "workspace": {"errors", "typed", "problem", "checkpoint", "record", "tables"},
     "run": {
         "errors", "files", "mdp", "motion", "policy", "problem", "sim", "tasks", "evaluation", "rl",
         "methods", "viewer", "config", "record", "tables", "workspace", "curves",
     },
     "launch": {"errors", "config", "record", "run"},
+    "bench": {
+        "errors", "mdp", "motion", "problem", "sim", "tasks", "rl", "methods", "config", "record",
+        "workspace", "run",
+    },
 }  # fmt: skip
-ROOFS = {"cli", "tsbench"}  # the commands, and the public face: they may know everything
+ROOFS = {"cli", "gym", "tsbench"}  # the commands and the public faces: they may know everything
 
 ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl"},
     "rsl_rl": {"rl"},
     "tensordict": {"rl"},
+    "gymnasium": {"sim", "gym", "bench"},
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},
     "dm_env": {"sim"},
@@ -67,7 +71,7 @@ ONLY_IN: dict[str, set[str]] = {
     "meshcat": {"viewer"},
     "matplotlib": {"curves", "viewer"},
     "tensorboard": {"workspace"},
-    "rich": {"tables", "workspace", "run", "cli", "launch"},
+    "rich": {"tables", "workspace", "run", "cli", "launch", "bench"},
 }
 STARTS_FAST = {"tsbench", "cli", "launch"}  # where an import may wait until it is needed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shlex
@@ -73,7 +74,8 @@ def normalised(name: str) -> str:
 def test_every_requirement_is_pinned(project: dict[str, Any]) -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {normalised(line.split("==")[0]) for line in lines if "==" in line}
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    extras = project["optional-dependencies"].values()
+    wanted = [*project["dependencies"], *itertools.chain(*extras)]
     assert {normalised(re.split(r"[<>=]", item)[0]) for item in wanted} <= pinned
 
 

@@ -373,16 +373,18 @@ def _report(words: Sequence[str]) -> None:
 
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
-    parser.add_argument("--only", metavar="NAME", help="one domain: laikago or rocket")
-    parser.add_argument("--quick", action="store_true", help="seconds instead of a minute")
+    parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago or sb3")
+    parser.add_argument("--quick", action="store_true", help="a minute, with larger ranges")
     options = parser.parse_args(words)
-    from dataclasses import asdict
+    from tsbench import bench
+    from tsbench.bench import table
 
-    from tsbench import bench, tables
-
-    result = bench.measure(only=options.only, quick=options.quick)
-    _write_json(options.json, asdict(result))
-    tables.show_bench(Console(), result)
+    progress = Console(stderr=True)
+    findings = bench.measure(
+        options.only, quick=options.quick, tell=lambda name: progress.print(f"measuring {name}")
+    )
+    _write_json(options.json, findings.as_dict())
+    table.show(Console(), findings)
 
 
 VERBS = {
@@ -390,7 +392,7 @@ VERBS = {
     "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
     "view": Verb("see a run, a plan or a task move: live, as a page or as a video", _view),
     "report": Verb("write one page about a run: what was planned, done and learned", _report),
-    "bench": Verb("measure how fast episodes are stepped", _bench),
+    "bench": Verb("measure how fast it is, side by side with others", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from tsbench.record import REPORT
-
-if TYPE_CHECKING:
-    from tsbench.bench import Result
 
 
 def duration(seconds: float) -> str:
@@ -111,22 +108,3 @@ def summary(record: Mapping[str, Any]) -> list[tuple[str, str]]:
         impulse = f"{bound}{number(robustness['impulse_50'])} N s"
         rows.append(("impulse that half survive", impulse))
     return rows
-
-
-def show_bench(console: Console, result: Result) -> None:
-    """Prints control steps per second and their ratios.
-
-    Args:
-        console: to print on.
-        result: what was measured.
-    """
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("control steps per second")
-    for header in ("median", "least", "most"):
-        table.add_column(header, justify="right")
-    for name, rate in result.rates.items():
-        table.add_row(name, *(f"{value:,.0f}" for value in (rate.median, rate.least, rate.most)))
-    console.print(table)
-    for name, ratio in result.ratios.items():
-        console.print(f"{name} = {ratio:.3g}", highlight=False)
-    console.print(", ".join(f"{key} {value}" for key, value in result.machine.items()))

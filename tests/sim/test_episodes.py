@@ -35,6 +35,7 @@ class Walk(MDP[Line]):
     name, version, horizon, timestep = "walk", 1, HORIZON, 0.5
     observation_size, action_size, max_reward = 3, 1, 2.0
     diverged = np.zeros(0, int)
+    seconds = 0.0  # of physics
 
     def __init__(self, starts: list[float], speeds: list[float]) -> None:
         self.starts, self.speeds = np.array(starts), np.array(speeds)

@@ -181,6 +181,7 @@ class Learner:
         observation = env.get_observations()
         while self.steps < steps:
             started = time.perf_counter()
+            before = (self.environment.seconds, self.environment.dynamics.seconds)
             with torch.inference_mode():
                 for _ in range(self.settings.rollout):
                     actions = ppo.act(observation)
@@ -198,6 +199,8 @@ class Learner:
             if report is not None:
                 metrics = {
                     "collect_seconds": collected - started,
+                    "environment_seconds": self.environment.seconds - before[0],
+                    "physics_seconds": self.environment.dynamics.seconds - before[1],
                     "update_seconds": time.perf_counter() - collected,
                     "value_loss": losses["value"],
                     "learning_rate": ppo.learning_rate,

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, Generic, Protocol
 
 import mujoco
@@ -42,9 +43,11 @@ class Dynamics(Protocol[S]):
     Attributes:
         diverged: rows in which the last step could not be computed, sorted. They keep the state
             they had before it, and their episodes have to end.
+        seconds: spent in a physics engine so far, wall-clock.
     """
 
     diverged: np.ndarray
+    seconds: float
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         """Starts new episodes in `rows` and returns their states."""
@@ -73,6 +76,7 @@ class Physics(Generic[S]):
         warnings: how often mujoco has warned, of each kind (mjtWarning), all episodes together.
         diverged: rows in which mujoco met a number that is not finite, or huge, in the last step.
             mujoco itself resets such a simulation and goes on in its midst.
+        seconds: spent in mujoco so far, wall-clock.
     """
 
     def __init__(
@@ -90,6 +94,7 @@ class Physics(Generic[S]):
         self.perturbed = perturbed
         self.push = push
         self.substeps = 0
+        self.seconds = 0.0
         self.warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), int)
         self.diverged = np.zeros(0, int)
         spec = task.spec()
@@ -97,7 +102,9 @@ class Physics(Generic[S]):
         model = spec.compile()
         if change is not None:
             change.apply(model)
-        self.batch = Batch(model, count, threads or 0)
+        # With memory of its own a simulation goes on from the sensors that were brought up to date,
+        # which otherwise costs half a substep; among twenty substeps that does not pay.
+        self.batch = Batch(model, count, threads or 0, persistent=task.substeps == 1)
         self._sensors = sensor_slices(model)
         self._qpos = self.batch.bind("qpos")
         self._qvel = self.batch.bind("qvel")
@@ -111,11 +118,13 @@ class Physics(Generic[S]):
     def place(self, rows: np.ndarray, start: Start) -> S:
         """Puts the simulations in `rows` where `start` says and returns their states."""
         ids = np.asarray(rows, np.int32)
+        began = perf_counter()
         self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self._qpos[rows] = start.qpos
         self._qvel[rows] = start.qvel
         with _one_line():
             self.batch.forward(ids, stage=_CURRENT)
+        self.seconds += perf_counter() - began
         return self._read(rows, start.time, start.memory)
 
     def advance(self, state: S, action: Array, rows: np.ndarray | None = None) -> S:
@@ -124,9 +133,11 @@ class Physics(Generic[S]):
         self._ctrl[at] = control
         self._force[at] = self.push_force(state.time, at)
         self.batch.warning[:] = 0
+        began = perf_counter()
         with _one_line():
             ids = None if rows is None else np.asarray(rows, np.int32)
             self.batch.step(ids, nstep=self.task.substeps, stage=_CURRENT)
+        self.seconds += perf_counter() - began
         self.substeps += len(control) * self.task.substeps
         following = self._read(at, state.time + self.task.timestep, memory)
         warned = self.batch.warning[at, :, _NUMBER]
@@ -189,21 +200,26 @@ def _one_line() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Transition:
-    """What a step gave; shapes (n,) but for the observation.
+class Transition(Generic[S]):
+    """What a step gave; shapes (n,) unless said otherwise.
 
     Attributes:
-        observation: of the state that follows; where an episode ended, of the next one's start.
+        observation: of the state that follows, shape (n, observation_size); where an episode
+            ended, of the next one's start.
         reward: of the step.
         terminal: the episode ended for a reason other than its last step. Its physics having
             diverged is one; the reward of that step is zero.
         truncated: the episode ended with its last step.
+        ended: the rows of either kind of ending, shape (k,).
+        final: the states that those episodes ended in, k of them.
     """
 
     observation: np.ndarray
     reward: np.ndarray
     terminal: np.ndarray
     truncated: np.ndarray
+    ended: np.ndarray
+    final: S
 
 
 class BatchedEnvironment(Generic[S]):
@@ -213,6 +229,7 @@ class BatchedEnvironment(Generic[S]):
         state: of all episodes.
         steps: steps taken in each episode since its start, shape (n,). An episode that starts
             along a reference motion starts with the steps that lie before.
+        seconds: spent in `step` so far, wall-clock.
     """
 
     def __init__(self, mdp: MDP[S], dynamics: LastingDynamics[S], count: int, seed: int) -> None:
@@ -222,6 +239,7 @@ class BatchedEnvironment(Generic[S]):
         self.rng = np.random.default_rng(seed)
         self.state: S
         self.steps = np.zeros(count, int)
+        self.seconds = 0.0
 
     def reset(self) -> np.ndarray:
         """Starts all episodes; returns the observations, shape (n, observation_size)."""
@@ -230,12 +248,13 @@ class BatchedEnvironment(Generic[S]):
         observation: np.ndarray = self.mdp.observation(self.state)
         return observation
 
-    def step(self, action: np.ndarray) -> Transition:
+    def step(self, action: np.ndarray) -> Transition[S]:
         """One time step of all episodes; `action` has shape (n, action_size).
 
         Raises:
             NotFiniteError: a number in action, state or reward is not finite.
         """
+        began = perf_counter()
         previous = self.state
         self.steps += 1
         expect_finite(self.steps, previous, action)
@@ -248,12 +267,15 @@ class BatchedEnvironment(Generic[S]):
             reward[diverged], terminal[diverged] = 0.0, True
         truncated = (self.steps >= self.mdp.horizon) & ~terminal
         ended = np.flatnonzero(terminal | truncated)
+        final = state.rows(ended)
         if len(ended):
             fresh = self.dynamics.begin(self.rng, ended)
             self.steps[ended] = np.rint(fresh.time / self.mdp.timestep).astype(int)
             state = state.updated(ended, fresh)
         self.state = state
-        return Transition(self.mdp.observation(state), reward, terminal, truncated)
+        observation = self.mdp.observation(state)
+        self.seconds += perf_counter() - began
+        return Transition(observation, reward, terminal, truncated, ended, final)
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next step depends on, but for the action: plain values and arrays."""

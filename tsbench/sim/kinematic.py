@@ -18,6 +18,8 @@ class Planning(MDP[S]):
     reward that could drift away from the first.
     """
 
+    seconds = 0.0  # in a physics engine: there is none
+
     def __init__(self, task: Task[S], *, explore: float = 0.0) -> None:
         """`explore` is the share of episodes that begin at a sampled state instead of the start:
         in kinematics any state can be visited at will, which is what makes planning easy."""

@@ -1,0 +1,185 @@
+"""Stable-Baselines3's PPO, which the paper used, against ours: time to the same score.
+
+Ours trains in two stages with budget=fast, to its end. Stable-Baselines3 then learns to imitate
+the same reference motion, until its deterministic policy scores as much from the task's own start;
+that it stops there, and that its plan is a gift, are in its favour. Its settings are ours wherever
+it has them: networks, steps between updates, epochs, minibatches, discounts, clipping, entropy,
+spread; observations are normalised by its VecNormalize. Where ours adapts the learning rate to a KL
+divergence, it keeps its default of 3e-4. Its environments are those of `tsbench.sim.gym`: for the
+rocket, whose steps are cheaper than a message, as many as ours in one process; for Laikago sixteen,
+each in a process of its own, with longer rollouts. Torch has one thread in both. Judging policies
+is not timed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from tsbench import methods
+from tsbench.bench import Findings, comparison
+from tsbench.bench.turns import Effort, Range
+from tsbench.config import compose
+from tsbench.mdp import Task
+from tsbench.motion import ReferenceMotion
+from tsbench.problem import Problem
+from tsbench.record import REFERENCE
+from tsbench.rl.ppo import PPOSettings
+from tsbench.rl.stages import settings
+from tsbench.run import prepare
+from tsbench.sim.batched import Physics
+from tsbench.sim.episodes import PolicyFunction, play
+from tsbench.sim.gym import GymEnvironment
+from tsbench.sim.single import environment
+from tsbench.sim.tracking import Imitation
+from tsbench.workspace import RunWorkspace
+
+LEARNING_RATE = 3e-4  # Stable-Baselines3's own
+PATIENCE = 10.0  # times our time, after which it has failed
+CHECKS = 40  # of its policy while it uses our number of steps
+PROCESSES = 16  # at most, where it pays to have any
+
+
+@comparison("sb3", requires=("stable_baselines3",), named=True)
+def rocket(effort: Effort) -> Findings:
+    return compare("rocket_navigation", effort, processes=False)
+
+
+@comparison("sb3_laikago", requires=("stable_baselines3",), named=True)
+def laikago(effort: Effort) -> Findings:
+    return compare("laikago_trot", effort, processes=True)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of a training.
+
+    Attributes:
+        score: normalized reward of the deterministic policy from the task's own start.
+        solved: whether it counts as success.
+        seconds: wall-clock of learning to imitate.
+        steps: environment steps of that.
+    """
+
+    score: float
+    solved: bool
+    seconds: float
+    steps: int
+
+    def __str__(self) -> str:
+        return (
+            f"normalized reward {self.score:.4g}, {'solved' if self.solved else 'not solved'}, "
+            f"{self.steps:,} steps in {self.seconds:.0f} s"
+        )
+
+
+def compare(name: str, effort: Effort, *, processes: bool) -> Findings:
+    problem = prepare(compose([f"task={name}", f"budget={effort.budget}"]))
+    with tempfile.TemporaryDirectory() as folder:
+        ours = train(problem, Path(folder))
+        reference = ReferenceMotion.load(Path(folder) / REFERENCE)
+    imitation = Imitation(problem.task, reference)
+    theirs = Rival(imitation, settings(problem, "imitate"), problem.seed, processes)
+    outcome = theirs.learn(ours, judge(problem.task))
+    arrived = "" if outcome.score >= ours.score else " (at least: it did not get there)"
+    ratio = outcome.seconds / ours.seconds
+    speed = (ours.steps / ours.seconds) / (outcome.steps / outcome.seconds)
+    return Findings(
+        figures={
+            f"{name}.ours": Range.of([ours.seconds], "s"),
+            f"{name}.sb3": Range.of([outcome.seconds], "s"),
+        },
+        ratios={
+            f"{name}.sb3/ours": Range.of([ratio]),
+            f"{name}.ours/sb3.steps_per_second": Range.of([speed]),
+        },
+        notes=[
+            f"{name}: ours: {ours}",
+            f"{name}: Stable-Baselines3: {outcome}; {ratio:.3g} times as long{arrived}",
+        ],
+    )
+
+
+Judge = Callable[[PolicyFunction], tuple[float, bool]]
+
+
+def judge(task: Task[Any]) -> Judge:
+    """Scores policies by one episode from the task's own start."""
+
+    def score(policy: PolicyFunction) -> tuple[float, bool]:
+        episode = play(task, Physics(task, 1), policy, 1, seed=0)
+        solved = task.success(episode.final) & ~episode.violated
+        return float(episode.normalized[0]), bool(solved[0])
+
+    return score
+
+
+def train(problem: Problem, folder: Path) -> Outcome:
+    """Our two stages; the reference motion is left in the folder."""
+    workspace = RunWorkspace(folder, Console(quiet=True))
+    policy = methods.find("twostage").train(problem, workspace)
+    workspace.close()
+    imitate = workspace.stages[-1]
+    return Outcome(*judge(problem.task)(policy), imitate.seconds, imitate.steps)
+
+
+class Rival:
+    """Stable-Baselines3's PPO in an imitation variant."""
+
+    def __init__(
+        self, imitation: Imitation[Any], chosen: PPOSettings, seed: int, processes: bool
+    ) -> None:
+        # The package is an extra: it is looked for when it is needed.
+        vectors: Any = importlib.import_module("stable_baselines3.common.vec_env")
+        count = min(chosen.environments, PROCESSES) if processes else chosen.environments
+        rollout = chosen.environments * chosen.rollout // count
+        kind = vectors.SubprocVecEnv if processes else vectors.DummyVecEnv
+        self._vector = vectors.VecNormalize(
+            kind([lambda: GymEnvironment(environment(imitation))] * count), norm_reward=False
+        )
+        self._ppo = importlib.import_module("stable_baselines3").PPO(
+            "MlpPolicy",
+            self._vector,
+            learning_rate=LEARNING_RATE,
+            n_steps=rollout,
+            batch_size=count * rollout // chosen.minibatches,
+            n_epochs=chosen.epochs,
+            gamma=chosen.discount,
+            gae_lambda=chosen.gae_lambda,
+            clip_range=chosen.clip,
+            ent_coef=chosen.entropy,
+            vf_coef=chosen.value_weight,
+            max_grad_norm=chosen.gradient_norm,
+            policy_kwargs={
+                "net_arch": list(chosen.hidden),
+                "log_std_init": math.log(chosen.initial_std),
+            },
+            seed=seed,
+            device="cpu",
+        )
+
+    def learn(self, ours: Outcome, score: Judge) -> Outcome:
+        """Until it scores as ours does, or has taken `PATIENCE` times as long."""
+        seconds = 0.0
+        while True:
+            began = time.perf_counter()
+            self._ppo.learn(ours.steps // CHECKS, reset_num_timesteps=False)
+            seconds += time.perf_counter() - began
+            reached, solved = score(self)
+            if reached >= ours.score or seconds > PATIENCE * ours.seconds:
+                self._vector.close()
+                return Outcome(reached, solved, seconds, int(self._ppo.num_timesteps))
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        normalised = self._vector.normalize_obs(observation)
+        action: np.ndarray = self._ppo.predict(normalised, deterministic=True)[0]
+        return action

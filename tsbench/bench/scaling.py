@@ -1,0 +1,33 @@
+"""The batched environment as environments and threads grow."""
+
+from __future__ import annotations
+
+import os
+
+from tsbench import tasks
+from tsbench.bench import Findings, comparison
+from tsbench.bench.stepping import batched
+from tsbench.bench.turns import Effort, take_turns
+
+DOMAINS = {"laikago": "laikago_trot", "rocket": "rocket_obstacles"}
+
+
+@comparison("scaling")
+def compare(effort: Effort) -> Findings:
+    """Rates by the number of environments, then by threads; ratios to those of the least."""
+    findings = Findings()
+    for domain, name in DOMAINS.items():
+        task = tasks.make(name)
+        by_environments = [batched(f"environments_{n}", task, n) for n in effort.counts]
+        by_threads = [
+            batched(f"threads_{n}", task, effort.count, threads=n)
+            for n in range(1, (os.cpu_count() or 1) + 1)
+        ]
+        for cases in (by_environments, by_threads):
+            rates = take_turns(cases, effort)
+            first, *rest = (case.name for case in cases)
+            for case in (first, *rest):
+                findings.figures[f"{domain}.{case}"] = rates.range(case)
+            for case in rest:
+                findings.ratios[f"{domain}.{case}/{first}"] = rates.ratio(case, first)
+    return findings

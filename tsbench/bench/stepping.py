@@ -1,0 +1,159 @@
+"""The batched environment against bare physics, a plain loop and Gymnasium's AsyncVectorEnv.
+
+All do control steps of the same task with the same kind of random actions:
+
+* `rollout`: bare `mujoco.rollout` from states and with controls that the batched environment went
+  through. States out; no sensors of the new state, no MDP, no resets. The limit.
+* `batched`: our environment. Actions in, observations, rewards, endings and resets out.
+* `loop`: a plain loop over one dm_control environment.
+* `async`: Gymnasium's AsyncVectorEnv, a process for each environment.
+* `planning`: the batched planning variant, whose steps are kinematic.
+* `planning_ik`: the planning variant's dm_control environment, where mink finds full poses.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv
+from mujoco.rollout import Rollout
+
+from tsbench import tasks
+from tsbench.bench import Findings, comparison
+from tsbench.bench.turns import Case, Effort, take_turns
+from tsbench.mdp import MDP, Task
+from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.gym import GymEnvironment
+from tsbench.sim.kinematic import Planning
+from tsbench.sim.single import environment
+
+NOISE = 0.2  # standard deviation of actions: robots move, and stand for a while
+RECORDED = 40  # control steps that the bare rollout repeats
+SINGLE_STEPS = 8  # of a single environment at a time
+PROCESSES = 4  # of AsyncVectorEnv for each core; measured best among 1, 4 and 16
+
+RATIOS = (
+    ("batched", "rollout"),
+    ("batched", "loop"),
+    ("batched", "async"),
+    ("planning", "batched"),
+    ("planning", "planning_ik"),
+)
+
+
+@comparison("laikago")
+def laikago(effort: Effort) -> Findings:
+    return compare("laikago", tasks.make("laikago_trot"), effort)
+
+
+@comparison("rocket")
+def rocket(effort: Effort) -> Findings:
+    return compare("rocket", tasks.make("rocket_obstacles"), effort)
+
+
+def compare(domain: str, task: Task[Any], effort: Effort) -> Findings:
+    variant: Planning[Any] = Planning(task)
+    cases = [
+        rollout(task, effort.count),
+        batched("batched", task, effort.count),
+        asynchronous(task),
+        loop("loop", task),
+        batched("planning", variant, effort.count),
+        loop("planning_ik", variant),
+    ]
+    rates = take_turns(cases, effort)
+    return Findings(
+        figures={f"{domain}.{case.name}": rates.range(case.name) for case in cases},
+        ratios={f"{domain}.{over}/{under}": rates.ratio(over, under) for over, under in RATIOS},
+    )
+
+
+def batched(
+    name: str, mdp: Task[Any] | Planning[Any], count: int, threads: int | None = None
+) -> Case:
+    """`count` environments stepped together."""
+    dynamics: Any = mdp if isinstance(mdp, Planning) else Physics(mdp, count, threads=threads)
+    batch = BatchedEnvironment(mdp, dynamics, count, seed=0)
+    rng = np.random.default_rng(0)
+    batch.reset()
+
+    def steps() -> int:
+        batch.step(random_actions(rng, mdp, count))
+        return count
+
+    return Case(name, steps)
+
+
+def loop(name: str, mdp: Task[Any] | Planning[Any]) -> Case:
+    """A plain loop over one dm_control environment."""
+    single = environment(mdp, seed=0)
+    rng = np.random.default_rng(0)
+    single.reset()
+
+    def steps() -> int:
+        for action in random_actions(rng, mdp, SINGLE_STEPS):
+            single.step(action)  # begins anew by itself
+        return SINGLE_STEPS
+
+    return Case(name, steps)
+
+
+def asynchronous(task: Task[Any]) -> Case:
+    """Gymnasium's own way to use all cores."""
+    count = PROCESSES * (os.cpu_count() or 1)
+    vector = AsyncVectorEnv([lambda: GymEnvironment(environment(task, seed=0))] * count)
+    rng = np.random.default_rng(0)
+    vector.reset(seed=0)
+
+    def steps() -> int:
+        vector.step(random_actions(rng, task, count))
+        return count
+
+    return Case("async", steps, vector.close)
+
+
+def rollout(task: Task[Any], count: int) -> Case:
+    """Bare physics through what the batched environment goes through."""
+    physics: Physics[Any] = Physics(task, count)
+    batch = BatchedEnvironment(task, physics, count, seed=0)
+    rng = np.random.default_rng(0)
+    batch.reset()
+    recorded = []
+    for _ in range(RECORDED):
+        state = full_states(physics.batch)
+        batch.step(random_actions(rng, task, count))
+        recorded.append((state, physics.batch.bind("ctrl").copy()))
+    return bare("rollout", physics.batch.model, recorded, task.substeps)
+
+
+def full_states(batch: mujoco.batch.Batch) -> np.ndarray:
+    """The states of all simulations as `mujoco.rollout` takes them, shape (n, size)."""
+    states = [batch.bind(name) for name in ("qpos", "qvel")]
+    time = np.zeros((batch.nsim, 1))
+    return np.concatenate([time, *states], axis=1)
+
+
+def bare(
+    name: str, model: mujoco.MjModel, recorded: list[tuple[np.ndarray, np.ndarray]], substeps: int
+) -> Case:
+    """`mujoco.rollout` over `substeps` from recorded states (n, size) with controls (n, nu)."""
+    threads = os.cpu_count() or 1
+    datas = [mujoco.MjData(model) for _ in range(threads)]
+    pool = Rollout(nthread=threads)
+    held = [(state, np.repeat(ctrl[:, None], substeps, axis=1)) for state, ctrl in recorded]
+    turns = itertools.cycle(held)
+
+    def steps() -> int:
+        state, controls = next(turns)
+        pool.rollout(model, datas, state, controls)
+        return len(state)
+
+    return Case(name, steps, pool.close)
+
+
+def random_actions(rng: np.random.Generator, mdp: MDP[Any], count: int) -> np.ndarray:
+    return rng.normal(0.0, NOISE, (count, mdp.action_size))

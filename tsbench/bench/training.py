@@ -1,0 +1,76 @@
+"""Where the time of a training goes: physics, MDP math, network inference, update, records.
+
+The planning and the imitation stage run as in `tsbench run`, with the settings that budget=fast has
+and records in files, only shorter. What is imitated is the plan of the hand-made planner.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from tsbench.bench import Findings, comparison
+from tsbench.bench.turns import Effort, Range
+from tsbench.config import compose
+from tsbench.problem import Problem
+from tsbench.record import METRICS
+from tsbench.rl.stages import learn_physics, learn_planning, settings
+from tsbench.run import prepare
+from tsbench.sim.kinematic import naive_plan
+from tsbench.sim.tracking import Imitation
+from tsbench.workspace import RunWorkspace
+
+TASKS = ("laikago_trot", "rocket_navigation")
+
+
+@comparison("training")
+def compare(effort: Effort) -> Findings:
+    findings = Findings()
+    for name in TASKS:
+        problem = prepare(compose([f"task={name}"]))
+        for stage in ("plan", "imitate"):
+            chosen = settings(problem, stage)
+            steps = chosen.environments * chosen.rollout
+            rows = train(problem, stage, steps * (effort.iterations + 1))
+            findings.add(split(f"{name}.{stage}", rows, steps))
+    return findings
+
+
+def train(problem: Problem, stage: str, steps: int) -> list[dict[str, float]]:
+    """The records of a stage's iterations."""
+    with tempfile.TemporaryDirectory() as folder:
+        workspace = RunWorkspace(Path(folder), Console(quiet=True))
+        if stage == "plan":
+            learn_planning(problem, workspace, steps)
+        else:
+            reference = problem.task.reference(naive_plan(problem.task))
+            imitation = Imitation(problem.task, reference)
+            learn_physics(problem, workspace, stage, imitation, stage, steps)
+        workspace.close()
+        lines = (Path(folder) / METRICS).read_text(encoding="utf-8").splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def split(name: str, rows: list[dict[str, float]], steps: int) -> Findings:
+    """Shares of the time of iterations of that many steps, but for the first, which allocates:
+    an iteration's record tells when it ended."""
+    whole = np.diff([row["seconds"] for row in rows])
+    collect, update, environment, physics = (
+        np.array([row[f"{part}_seconds"] for row in rows[1:]])
+        for part in ("collect", "update", "environment", "physics")
+    )
+    parts = {
+        "physics": physics,
+        "mdp": environment - physics,
+        "inference": collect - environment,
+        "update": update,
+        "records": whole - collect - update,
+    }
+    return Findings(
+        figures={f"{name}": Range.of(steps / whole, "steps/s")},
+        ratios={f"{name}.{part}/whole": Range.of(taken / whole) for part, taken in parts.items()},
+    )
