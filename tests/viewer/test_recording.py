@@ -10,6 +10,7 @@ import pytest
 from tsbench import tasks
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.protocol import SMOKE
 from tsbench.motion import ReferenceMotion
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.tasks.laikago import LaikagoState
@@ -25,7 +26,7 @@ def test_an_episode_is_the_one_that_is_scored() -> None:
     task = tasks.make("rocket_obstacles")
     policy = steadily(0.7, 0.0)
     recording = record_episode(task, policy)
-    score = evaluate(policy, task, episodes=1)
+    score = evaluate(policy, task, protocol=SMOKE)
     assert len(recording.times) == len(recording.states.time) == score.nominal.steps + 1
     assert recording.goal_distance[-1] == score.nominal.goal_distance
     earned = recording.reward_terms["reward"].sum() / (task.max_reward * task.horizon)
