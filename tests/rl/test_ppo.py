@@ -16,7 +16,7 @@ from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS, Policy
 from tsbench.problem import Budget, Problem
 from tsbench.rl.ppo import Learner, PPOSettings
-from tsbench.rl.stages import settings
+from tsbench.rl.stages import StageSettings, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.episodes import play
@@ -204,15 +204,15 @@ def problem(environments: int | None = None, **training: Any) -> Problem:
 
 
 def test_settings() -> None:
-    assert settings(problem(), "plan") == PPOSettings()
+    assert settings(problem(), "plan") == StageSettings()
     chosen = settings(problem(plan={"hidden": [32, 16], "discount": 1, "desired_kl": None}), "plan")
     assert chosen.hidden == (32, 16)
     assert (chosen.discount, chosen.desired_kl) == (1.0, None)
-    assert settings(problem(plan={"entropy": 0.5}), "task") == PPOSettings()
+    assert settings(problem(plan={"entropy": 0.5}), "task") == StageSettings()
     assert settings(problem(16, plan={"environments": 999}), "plan").environments == 16
     # The last stage goes on with the imitation's network.
     both = problem(imitate={"hidden": [8], "entropy": 0.1}, finetune={"entropy": 0.2})
-    assert settings(both, "finetune") == PPOSettings(hidden=(8,), entropy=0.2)
+    assert settings(both, "finetune") == StageSettings(hidden=(8,), entropy=0.2)
 
 
 @pytest.mark.parametrize(
