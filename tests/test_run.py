@@ -405,4 +405,5 @@ def test_stages_are_plain_values() -> None:
         "physics_substeps",
         "seconds",
         "interruptions",
+        "warnings",
     }

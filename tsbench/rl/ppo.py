@@ -42,6 +42,8 @@ class PPOSettings:
     clip_value: whether the value loss is clipped too.
     entropy: weight of the entropy bonus.
     learning_rate: at first.
+    final_learning_rate: that the learning rate falls to geometrically over a stage, or None; only
+        without `desired_kl`. What is judged is the last policy, and a steady rate keeps it moving.
     desired_kl: that the learning rate is adapted to after every minibatch, or None to keep it.
     value_weight: of the value loss.
     gradient_norm: that gradients are clipped to.
@@ -65,6 +67,7 @@ class PPOSettings:
     clip_value: bool = False
     entropy: float = 0.0
     learning_rate: float = 1e-3
+    final_learning_rate: float | None = None
     desired_kl: float | None = 0.01
     value_weight: float = 1.0
     gradient_norm: float = 1.0
@@ -84,6 +87,13 @@ class PPOSettings:
                 raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
         if self.final_std is not None and not 0.0 < self.final_std <= self.initial_std:
             raise ValueError("final_std must be positive and at most initial_std, or null")
+        if self.final_learning_rate is not None:
+            if self.desired_kl is not None:
+                raise ValueError("final_learning_rate needs desired_kl: null")
+            if not 0.0 < self.final_learning_rate <= self.learning_rate:
+                raise ValueError(
+                    "final_learning_rate must be positive and at most learning_rate, or null"
+                )
         for name in ("entropy", "value_weight"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
@@ -195,7 +205,7 @@ class Learner:
             losses = ppo.update()
             self._expect_finite(losses)
             self.steps += env.num_envs * self.settings.rollout
-            self._bound_std(min(self.steps / steps, 1.0))
+            self._settle(min(self.steps / steps, 1.0))
             if report is not None:
                 metrics = {
                     "collect_seconds": collected - started,
@@ -221,12 +231,19 @@ class Learner:
                 message = f"the {name} loss is not finite in the iteration after {self.steps} steps"
                 raise NotFiniteError(message, arrays)
 
-    def _bound_std(self, share: float) -> None:
-        """Holds the policy's spread below its bound after a share of the stage."""
-        first, last = self.settings.initial_std, self.settings.final_std
-        if last is not None:
+    def _settle(self, share: float) -> None:
+        """Holds the policy's spread below its bound, and lowers the learning rate, after a share
+        of the stage."""
+        s = self.settings
+        if s.final_std is not None:
+            bound = s.initial_std * (s.final_std / s.initial_std) ** share
             with torch.no_grad():
-                self._ppo.actor.distribution.std_param.clamp_(max=first * (last / first) ** share)
+                self._ppo.actor.distribution.std_param.clamp_(max=bound)
+        if s.final_learning_rate is not None:
+            rate = s.learning_rate * (s.final_learning_rate / s.learning_rate) ** share
+            self._ppo.learning_rate = rate
+            for group in self._ppo.optimizer.param_groups:
+                group["lr"] = rate
 
     def _count(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
         self._return += rewards.numpy()
