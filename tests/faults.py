@@ -4,17 +4,16 @@
     make faults N=3        what CI does
 
 Runs are started by `cli.main` in forked processes, which spares each of them some seconds of
-imports, and killed by signals from outside, each when it has used a random amount of processor
-time, so that a busy machine does not change where the kills fall. After the kills a run is resumed
-until it ends, and what it leaves is compared with a run that was left alone: the bytes of policy,
-plan and reference, the metrics but for wall-clock, and the score.
+imports, and killed by signals from outside: in an iteration drawn at random or after the last one,
+and there after a random amount of processor time, which a busy machine does not change. After the
+kills a run is resumed until it ends, and what it leaves is compared with a run that was left alone:
+the bytes of policy, plan and reference, the metrics but for wall-clock, and the score.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import random
 import resource
@@ -51,6 +50,8 @@ ROCKET = [
     "task.budgets.smoke.act=2_048",
     "task.training.plan.rollout=32",
     "task.training.imitate.rollout=32",
+    "task.training.imitate.epochs=2",
+    "task.training.imitate.minibatches=4",
     "task.constants.distance=20.0",
 ]
 LAIKAGO = [
@@ -58,6 +59,7 @@ LAIKAGO = [
     "task.budgets.smoke.plan=1_536",
     "task.budgets.smoke.act=1_152",
     "task.training.plan.rollout=32",
+    "task.training.imitate.epochs=2",
 ]
 RUNS = {
     "rocket, three stages": [*ROCKET, "method.finetune=0.5"],
@@ -109,6 +111,10 @@ class Process:
         fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
+    def size(self) -> int:
+        """Bytes of address space."""
+        return int(Path(f"/proc/{self.pid}/statm").read_text().split()[0]) * resource.getpagesize()
+
     def ended(self) -> bool:
         if self.status is None:
             pid, status, usage = os.wait4(self.pid, os.WNOHANG)
@@ -126,7 +132,7 @@ class Process:
             if time.monotonic() > deadline:
                 os.kill(self.pid, signal.SIGKILL)
                 raise TimeoutError(f"a run did not end; see {self.errors}")
-            time.sleep(0.002)
+            time.sleep(0.02)
         return False
 
     def until_used(self, seconds: float) -> bool:
@@ -218,13 +224,22 @@ class Campaign:
             interval = INTERVALS[number % len(INTERVALS)]
             folder, number = self.folder / f"killed {number}", number + 1
             expected, cost = self.uninterrupted(name)
+            total = len(expected["metrics"])
             killed = 0
             words = ["run", *RUNS[name], f"checkpoint={interval}", "directory=run"]
             while True:
                 begun = (folder / "run" / "config.yaml").exists()
                 process = Process(["run", "resume=run"] if begun else words, folder)
-                may = killed < KILLS and self.kills.total() < count
-                if not process.until_used(self.random.uniform(0.0, cost) if may else math.inf):
+                if killed == KILLS or self.kills.total() == count:
+                    process.wait()
+                    break
+                done = iterations(folder)
+                target = self.random.randint(min(done + 1, total), total)
+                if not process.until_iterations(target):
+                    break
+                # Within the next iteration, or in what comes after the last one.
+                span = cost / 2 if target == total else cost / 2 / total
+                if not process.until_used(process.used() + self.random.uniform(0.0, span)):
                     break
                 stage = where(folder / "run")
                 os.kill(process.pid, signal.SIGKILL)
@@ -313,7 +328,8 @@ class Campaign:
         folder, process = self.begin("no more memory", 0.0)
         process.until_iterations(3)
         before = iterations(folder)
-        resource.prlimit(process.pid, resource.RLIMIT_AS, (1 << 20, 1 << 20))
+        limit = process.size()  # not a page more
+        resource.prlimit(process.pid, resource.RLIMIT_AS, (limit, limit))
         refused = process.wait() == 2 and "out of memory" in process.line()
         self.ends(f"memory limit after {before} iterations", folder, refused, process)
 

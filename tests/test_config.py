@@ -146,6 +146,7 @@ def test_typed_builds_what_the_annotations_say() -> None:
         ({"inner": {"size": 3}, "sizes": 1}, "sizes must be a list, not 1"),
         ({"inner": {"size": 3}, "by_name": {"a": 1}}, "by_name.a must be true or false, not 1"),
         ({"inner": {"size": 3}, "rate": "fast"}, "rate must be a number, not 'fast'"),
+        ({"inner": {"size": 3}, "rate": 10**400}, "rate must be a number, not 1000"),
         ({"inner": {"size": 3}, "rate": -1.0}, "rate must not be negative"),
         ({"inner": {"size": 3, "szie": 4}}, "unknown key in inner 'szie'; allowed: size"),
         ([1], "the configuration must be key: value pairs, not [1]"),

@@ -340,22 +340,56 @@ def test_changed_constants_are_recorded(tmp_path: Path) -> None:
     assert policy.info.method == "monolithic"
 
 
-def test_a_sweep_goes_on_after_a_failure(
+SHORT = [*WORDS[:3], "task.budgets.smoke.act=512", "task.training.imitate.epochs=1"]
+
+
+def test_a_sweep_goes_on_after_failures_and_lists_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """One directory is taken, one run meets a bug; when it is mended, only that is done."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["tsbench"])
-    words = ["run", "-m", *WORDS[:3], "seed=0,1"]
-    taken = launch.directory(config.compose(WORDS[:3]), WORDS[:3])
-    taken.mkdir(parents=True)
-    (taken / "notes.txt").write_text("precious")
-    assert cli.main(words) == 2
-    errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 2
-    assert "nothing is overwritten" in errors[0]
-    assert errors[1] == "tsbench: 1 of the sweep's runs failed (see above)"
-    other = Path(str(taken).replace("seed0", "seed1"))
-    assert record.read_score(other)["seed"] == 1
+    words = ["run", "-m", *SHORT, "seed=0,1,2"]
+    places = [
+        launch.directory(config.compose([*SHORT, f"seed={seed}"]), SHORT) for seed in (0, 1, 2)
+    ]
+    places[0].mkdir(parents=True)
+    (places[0] / "notes.txt").write_text("precious")
+
+    def fail(metrics: Path, *_: object) -> None:
+        if metrics.parent == places[1]:
+            raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("tsbench.curves.draw", fail)
+        assert cli.main(words) == 2
+    first, second, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("tsbench: failed: task=rocket_navigation")
+    assert "nothing is overwritten" in first
+    assert "seed=1: ZeroDivisionError('a bug')" in second
+    assert second.endswith(f"(log: {places[1] / 'log.txt'})")
+    assert "ZeroDivisionError: a bug" in (places[1] / "log.txt").read_text()
+    assert last == "tsbench: 2 of the sweep's runs failed (see above)"
+    assert record.read_score(places[2])["seed"] == 2
+
+    (places[0] / "notes.txt").unlink()
+    before = (places[2] / "score.json").stat().st_mtime_ns
+    assert cli.main(words) == 0
+    out = capsys.readouterr().out
+    assert f"finished already: {places[2]}" in out
+    assert "resumed: imitate goes on at " in (places[1] / "log.txt").read_text()
+    assert (places[2] / "score.json").stat().st_mtime_ns == before
+    assert [record.read_score(place)["seed"] for place in places] == [0, 1, 2]
+
+
+def test_a_sweep_does_not_take_another_run_for_its_own(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["tsbench"])
+    before = (finished / "score.json").read_bytes()
+    assert cli.main(["run", "-m", *WORDS[:3], "seed=4", "directory=one"]) == 2
+    assert "one holds a run with another configuration" in capsys.readouterr().err
+    assert (finished / "score.json").read_bytes() == before
 
 
 def test_the_standard_directory() -> None:
@@ -387,6 +421,17 @@ def test_a_stage_on_a_terminal_and_elsewhere(tmp_path: Path) -> None:
         assert "plan: 100 steps in 0:00, reward 2.5, " in text
     row = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[0])
     assert row.keys() == {"stage", "steps", "seconds", "episode_return"}
+
+
+def test_mujocos_warnings_are_told(tmp_path: Path) -> None:
+    workspace = RunWorkspace(tmp_path, Console(file=(tmp_path / "out").open("w")))
+    with workspace.stage("imitate", 10) as monitor:
+        monitor.warnings = {"mjWARN_BADQACC": 1234}
+        monitor.update(10, {})
+    workspace.close()
+    assert workspace.stage_rows()[0]["warnings"] == {"mjWARN_BADQACC": 1234}
+    log = (tmp_path / "log.txt").read_text()
+    assert "imitate: mujoco warned 1,234 times of mjWARN_BADQACC" in log
 
 
 def test_numbers_as_people_read_them() -> None:

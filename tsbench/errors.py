@@ -69,13 +69,16 @@ def os_errors(path: Path | str) -> Iterator[None]:
         raise TsbenchError(f"{error.filename or path}: {error.strerror or error}") from None
 
 
+_NO_MEMORY = ("allocate memory", "start new thread", "Resource temporarily unavailable")
+
+
 @contextmanager
 def memory_errors() -> Iterator[None]:
     """Turns a refusal of memory, by Python, numpy, mujoco or torch, into one line."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        # torch raises a plain RuntimeError.
-        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
+        # torch, and whoever cannot start a thread, raises a plain RuntimeError.
+        if isinstance(error, RuntimeError) and not any(sign in str(error) for sign in _NO_MEMORY):
             raise
         raise TsbenchError("out of memory: fewer environments need less") from None

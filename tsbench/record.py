@@ -48,7 +48,7 @@ def read_config(directory: Path) -> RunConfig:
         with os_errors(path):
             content = yaml.safe_load(path.read_text(encoding="utf-8"))
         config: RunConfig = typed(RunConfig, content, "")
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date such as 2026-99-99
         reason = " ".join(str(error).split())
         raise TsbenchError(f"damaged configuration {path}: {reason}") from None
     except TsbenchError as error:
@@ -67,9 +67,14 @@ def read_score(directory: Path) -> dict[str, Any]:
         content = path.read_bytes()
     try:
         record = json.loads(content)
-        if not isinstance(record["score"], dict):
-            raise ValueError("no score in it")
-    except (ValueError, KeyError, TypeError) as error:
+        for name in ("task", "method", "seed", "budget"):
+            record[name]
+        for name in ("normalized_reward", "optimality", "success"):
+            if not isinstance(record["score"][name], (int, float)):
+                raise ValueError(f"{name} is no number")
+    except KeyError as error:
+        raise TsbenchError(f"damaged score {path}: {error} is missing") from None
+    except (ValueError, TypeError, RecursionError) as error:
         raise TsbenchError(f"damaged score {path}: {error}") from None
     return dict(record)
 

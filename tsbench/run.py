@@ -114,8 +114,8 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
             _write_provenance(directory, config, problem, words)
             line = f"{' '.join(['tsbench run', *words])} -> {directory}"
             return _work(config, problem, directory, line, console or Console())
-        except (TsbenchError, OSError):
-            if not _trained(directory):
+        except (TsbenchError, OSError) as error:
+            if not _trained(directory) and not isinstance(error, NotFiniteError):
                 shutil.rmtree(directory, ignore_errors=True)
             raise
 
@@ -172,7 +172,7 @@ def _work(
     workspace = RunWorkspace(
         directory, console, interval=config.checkpoint, run=hashlib.sha256(run.encode()).hexdigest()
     )
-    with closing(workspace), _signals(workspace.stop):
+    with closing(workspace), _signals(workspace.stop), memory_errors():
         workspace.note(line)
         score = _train(config, problem, workspace, console)
     shutil.rmtree(directory / CHECKPOINTS, ignore_errors=True)
@@ -215,7 +215,7 @@ def _signals(stop: Callable[[int], None]) -> Iterator[None]:
 def _explained(directory: Path) -> Iterator[None]:
     """Turns what stops a run into one line, which says how to go on where one can."""
     try:
-        with os_errors(directory), memory_errors():
+        with os_errors(directory):
             yield
     except NotFiniteError as error:
         raise TsbenchError(f"{error}{_dumped(directory, error)}") from error
@@ -327,7 +327,7 @@ def _check_provenance(directory: Path, config: RunConfig, problem: Problem) -> N
         content = path.read_bytes()
     try:
         before = dict(json.loads(content))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise TsbenchError(f"damaged versions {path}: {error}") from None
     for name, now in _identity(config, problem).items():
         if before.get(name) != now:

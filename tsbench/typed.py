@@ -42,7 +42,7 @@ def typed(kind: Any, value: Any, path: str) -> Any:
         return {str(k): typed(arguments[1], v, _join(path, str(k))) for k, v in value.items()}
     if origin in (list, tuple) and isinstance(value, (list, tuple)):
         return origin(typed(arguments[0], v, f"{path}[{i}]") for i, v in enumerate(value))
-    if kind is float and type(value) is int:
+    if kind is float and type(value) is int and abs(value) < 2**1023:
         return float(value)
     if type(value) is kind:
         return value
