@@ -1,0 +1,51 @@
+"""Stored reference scores against the code that makes them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tsbench import tasks
+from tsbench.evaluation.evaluate import best_return, evaluate
+from tsbench.evaluation.protocol import V1
+from tsbench.evaluation.references import POLICIES, random, stored
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_the_oracle_is_remade(name: str) -> None:
+    task, content = tasks.make(name), stored(name)
+    assert content["task_version"] == task.version
+    assert content["protocol"] == V1.name
+    assert content["best_return"] == pytest.approx(best_return(task), rel=1e-12)
+    oracle = content["rows"]["oracle"]
+    assert oracle["normalized_reward"] * task.max_reward * task.horizon == pytest.approx(
+        content["best_return"]
+    )
+    assert oracle["optimality"] == 1.0
+
+
+@pytest.mark.parametrize("policy", sorted(POLICIES))
+@pytest.mark.parametrize("name", tasks.names())
+def test_the_reference_policies_are_remade(name: str, policy: str) -> None:
+    """All but the pushes, of which few are tried: those at the claim, at one phase."""
+    task, row = tasks.make(name), stored(name)["rows"][policy]
+    few = replace(V1, conditions=(), headings=4, phases=24, forces=(100.0,))
+    score = evaluate(POLICIES[policy](task), task, protocol=few, threads=1)
+    assert score.normalized_reward == pytest.approx(row["normalized_reward"], rel=1e-9)
+    assert score.optimality == pytest.approx(row["optimality"], rel=1e-9)
+    assert score.success == row["success"]
+    assert score.perturbed.success == row["perturbed_success"]
+    if row["survival_100N"] in (0.0, 1.0):
+        assert score.robustness.survival_100N == row["survival_100N"]
+
+
+def test_the_random_policy_is_a_function() -> None:
+    policy = random(tasks.make("laikago_walk"))
+    observations = np.random.default_rng(0).normal(size=(2000, 43))
+    actions = policy(observations)
+    np.testing.assert_array_equal(policy(observations[5:6])[0], actions[5])
+    assert abs(actions.mean()) < 0.02
+    assert actions.std() == pytest.approx(1.0 / np.sqrt(3.0), rel=0.02)
+    assert np.abs(actions).max() <= 1.0
