@@ -95,6 +95,19 @@ def test_steps_are_counted() -> None:
         assert 0.0 < metrics["episode_return"] < 15 * 0.9
 
 
+def test_rate_and_spread_fall_over_a_stage() -> None:
+    """By equal factors: four iterations of 128 steps take 1e-3 to 1e-5 in steps of 10^0.5."""
+    settings = replace(
+        TINY, desired_kl=None, final_learning_rate=1e-5, initial_std=0.8, final_std=0.05
+    )
+    taught = learner(settings)
+    reports: list[Mapping[str, float]] = []
+    taught.learn(512, lambda _, metrics: reports.append(metrics))
+    rates = [metrics["learning_rate"] for metrics in reports]
+    np.testing.assert_allclose(rates, 1e-3 * 10.0 ** (-0.5 * np.arange(1, 5)))
+    assert 0.0 < taught._ppo.actor.distribution.std_param.max().item() <= 0.05 + 1e-6
+
+
 def test_physics_steps_are_counted() -> None:
     task = tasks.make("laikago_walk")
     physics = Physics(task, 8, threads=1)
@@ -237,6 +250,8 @@ def test_settings() -> None:
         ({"discount": 1.01}, r"discount must lie in \[0, 1\]"),
         ({"gae_lambda": -0.1}, r"gae_lambda must lie in \[0, 1\]"),
         ({"activation": "selu"}, r"activation must be one of elu, relu, tanh"),
+        ({"final_learning_rate": 1e-4}, "final_learning_rate needs desired_kl: null"),
+        ({"final_learning_rate": 1.0, "desired_kl": None}, "final_learning_rate must be positive"),
         ({"encoding": "log"}, r"encoding must be one of plain, symlog"),
         ({"clip": -0.2}, r"clip"),
         ({"desired_kl": 0.0}, r"desired_kl"),
