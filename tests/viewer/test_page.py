@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import errno
+import io
+import itertools
 import json
 import math
 import os
@@ -10,8 +13,9 @@ import re
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +25,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from websockets.sync.client import ClientConnection, connect
 
 from tsbench.errors import TsbenchError
 from tsbench.sim.model import load_spec
@@ -301,83 +306,117 @@ def test_the_camera_looks_from_where_motion_goes_from_left_to_right() -> None:
 # What is seen
 
 
-@dataclass(frozen=True)
+WIDTH, HEIGHT = 1000, 560
+PATIENCE = 120.0  # s
+SCREENSHOTS = Path(__file__).parents[2] / "screenshots"  # kept, for people to look at
+DRAWN = """new Promise((done) => {
+  const frames = (count) => requestAnimationFrame(() => count ? frames(count - 1) : done());
+  if (document.readyState === "complete") frames(4); else addEventListener("load", () => frames(4));
+})"""
+
+
 class Browser:
-    """Headless Chromium with software WebGL, a fresh profile for every page."""
+    """Headless Chromium with software WebGL, led by its DevTools protocol.
 
-    program: str
-    folder: Path
+    Chromium's own flags for a picture (--virtual-time-budget, --screenshot) would do, but on a busy
+    machine its virtual time now and then stands still for good.
+    """
 
-    def run(self, url: str, *flags: str) -> str:
-        """Opens the address and returns what Chromium printed.
+    def __init__(self, connection: ClientConnection) -> None:
+        self._connection = connection
+        self._calls = itertools.count(1)
+        self._session: str | None = None
+        self._spoken: list[str] = []
 
-        On a busy machine Chromium's virtual time now and then stands still for good before a page
-        is drawn: it is stopped and asked again, a few times.
-        """
-        for _ in range(TRIES):
-            try:
-                printed, spoken = self._run(url, *flags)
-            except subprocess.TimeoutExpired:
-                continue
-            # Of Chromium's own, about taking the picture.
-            unexpected = [line for line in spoken if "GPU stall due to ReadPixels" not in line]
-            assert not unexpected
-            return printed
-        raise AssertionError(f"Chromium stood still {TRIES} times over {url}")
+    def call(self, method: str, **parameters: Any) -> Any:
+        """Gives a command and returns its result; what the page says meanwhile is kept."""
+        number = next(self._calls)
+        message = {"id": number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        self._connection.send(json.dumps(message))
+        while True:
+            answer = json.loads(self._connection.recv(PATIENCE))
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                return answer["result"]
+            if answer.get("method") in SPEECH:
+                self._spoken.append(json.dumps(answer["params"]))
 
-    def _run(self, url: str, *flags: str) -> tuple[str, list[str]]:
-        """What Chromium printed, and what the page said on its console.
+    @contextmanager
+    def open(self, url: str) -> Iterator[None]:
+        """A page, drawn; in the end the test fails if there was anything on its console."""
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)
+        self._session, self._spoken = session["sessionId"], []
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+        size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
+        self.call("Page.navigate", url=url)
+        self.ask(DRAWN)
+        yield
+        # Of Chromium's own, about taking the picture.
+        unexpected = [line for line in self._spoken if "GPU stall due to ReadPixels" not in line]
+        self._session = None
+        self.call("Target.closeTarget", targetId=target)
+        assert not unexpected
 
-        Raises:
-            subprocess.TimeoutExpired: Chromium did not end by itself.
-        """
-        profile = self.folder / "profile"
-        shutil.rmtree(profile, ignore_errors=True)
-        command = [
-            *(self.program, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic"),
-            *("--no-first-run", "--disable-background-networking", "--disable-component-update"),
-            *("--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-            *("--hide-scrollbars", "--enable-logging=stderr", f"--user-data-dir={profile}"),
-            *("--force-device-scale-factor=1", f"--window-size={WIDTH},{HEIGHT}", *flags, url),
-        ]
-        with subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        ) as process:
-            try:
-                printed, errors = process.communicate(timeout=PATIENCE)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)  # with all its children
-                raise
-        return printed, [line for line in errors.splitlines() if "CONSOLE" in line]
+    def ask(self, expression: str) -> Any:
+        """The value of an expression in the page, once it has one if it is a promise."""
+        result = self.call(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def screenshot(self, name: str) -> NDArray[np.int64]:
+        """The page as it is seen, kept under that name, shape (rows, columns, 3)."""
+        content = base64.b64decode(self.call("Page.captureScreenshot")["data"])
+        SCREENSHOTS.mkdir(exist_ok=True)
+        (SCREENSHOTS / f"{name}.png").write_bytes(content)
+        pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), np.int64)
+        assert pixels.shape == (HEIGHT, WIDTH, 3)
+        return pixels
 
     def picture(self, path: Path, address: str) -> NDArray[np.int64]:
         """What is seen of a page between its card and its bar, shape (rows, columns, 3)."""
-        SCREENSHOTS.mkdir(exist_ok=True)
-        image = SCREENSHOTS / f"{path.stem}_{re.sub('[^a-z0-9]+', '_', address)}.png"
-        image.unlink(missing_ok=True)
-        url = f"{path.as_uri()}#{address}"
-        self.run(url, "--virtual-time-budget=1500", f"--screenshot={image}")
-        assert image.is_file(), "Chromium took no picture"
-        pixels = np.asarray(Image.open(image).convert("RGB"), np.int64)
-        assert pixels.shape == (HEIGHT, WIDTH, 3)
-        return pixels[30 : HEIGHT - 70, 330:]
+        with self.open(f"{path.as_uri()}#{address}"):
+            name = f"{path.stem}_{re.sub('[^a-z0-9]+', '_', address)}"
+            return self.screenshot(name)[30 : HEIGHT - 70, 330:]
 
 
-WIDTH, HEIGHT = 1000, 560
-TRIES, PATIENCE = 6, 90.0  # s
-SCREENSHOTS = Path(__file__).parents[2] / "screenshots"  # kept, for people to look at
+SPEECH = ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded")
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Browser:
-    for name in ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"):
-        if program := shutil.which(name):
-            return Browser(program, tmp_path)
-    pytest.fail("no Chromium on PATH: install `chromium` (Debian) or Google Chrome")
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    programs = [program for name in names if (program := shutil.which(name))]
+    if not programs:
+        pytest.fail("no Chromium on PATH: install `chromium` (Debian) or Google Chrome")
+    profile = tmp_path_factory.mktemp("chromium")
+    command = [
+        *(programs[0], "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic"),
+        *("--no-first-run", "--disable-background-networking", "--disable-component-update"),
+        *("--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+        *("--hide-scrollbars", "--force-device-scale-factor=1", f"--user-data-dir={profile}"),
+        *("--remote-debugging-port=0", "about:blank"),
+    ]
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True) as process:
+        try:
+            port = profile / "DevToolsActivePort"  # its port, then the path of its socket
+            deadline = time.monotonic() + PATIENCE
+            while not (port.exists() and port.read_text().count("\n")):
+                assert process.poll() is None, "Chromium ended at once"
+                assert time.monotonic() < deadline, "Chromium did not start"
+                time.sleep(0.1)
+            number, path = port.read_text().splitlines()
+            with connect(f"ws://127.0.0.1:{number}{path}", max_size=None, proxy=None) as connection:
+                yield Browser(connection)
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)  # with all its children
 
 
 def centre(mask: NDArray[np.bool_]) -> float:
@@ -400,6 +439,18 @@ def dark(pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
 def solid(pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
     """What is neither sky nor a thin line on it."""
     return np.abs(pixels - SKY).max(axis=-1) > 25
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("fault", ["console.warn('oh')", "oh.no()", "fetch('http://localhost:9')"])
+def test_a_fault_on_a_page_would_be_noticed(browser: Browser, tmp_path: Path, fault: str) -> None:
+    path = tmp_path / "fault.html"
+    policy = "default-src 'none'; script-src 'unsafe-inline'"
+    path.write_text(
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}"><script>{fault}</script>'
+    )
+    with pytest.raises(AssertionError), browser.open(path.as_uri()):
+        pass
 
 
 @pytest.mark.browser
@@ -458,8 +509,9 @@ def test_a_page_plays_when_opened_and_rests_where_asked(browser: Browser, tmp_pa
     write_page(path, rocket(), flight(0.02), 0.02, title="")
 
     def shown(address: str) -> float:
-        printed = browser.run(path.as_uri() + address, "--virtual-time-budget=1500", "--dump-dom")
-        clock = re.search(r'<output id="clock">([\d.]+) / 11\.98 s</output>', printed)
+        with browser.open(path.as_uri() + address):
+            text = browser.ask("document.getElementById('clock').textContent")
+        clock = re.fullmatch(r"([\d.]+) / 11\.98 s", text)
         assert clock
         return float(clock[1])
 
@@ -491,12 +543,14 @@ def test_a_report_follows_its_view(browser: Browser, make_run: Callable[..., Pat
     run = make_run("rocket_obstacles", 0.7)
     path = run / "report.html"
     page.write(path, report.render(run))
-    printed = browser.run(path.as_uri(), "--virtual-time-budget=1500", "--dump-dom")
-    heads = re.findall(r'<i style="[^"]*left: ([\d.]+)%;"></i>', printed)
-    assert len(heads) == 4 + 3  # reward and its terms, joints
-    browser.run(
-        path.as_uri(), "--virtual-time-budget=1500", f"--screenshot={SCREENSHOTS}/report.png"
-    )
+    heads = "[...document.querySelectorAll('.chart i')].map((head) => parseFloat(head.style.left))"
+    with browser.open(path.as_uri()):
+        browser.ask(f"""new Promise((done) => {{
+          const look = () => {heads}.every((x) => x > 0) ? done() : requestAnimationFrame(look);
+          look();
+        }})""")
+        assert len(browser.ask(heads)) == 4 + 3  # the reward and its terms, the joints
+        browser.screenshot("report")
 
 
 @pytest.mark.browser
