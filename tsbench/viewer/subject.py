@@ -131,8 +131,8 @@ def pair(runs: Sequence[str], push: Push | None = None) -> Show:
     subjects = [run_subject(Path(word)) for word in runs]
     recordings = [record_episode(s.task, cast(Policy, s.policy), push) for s in subjects]
     verdict = " ".join(
-        f"{name} is {word}. {executed_in_words(recording)}"
-        for name, word, recording in zip("AB", runs, recordings, strict=True)
+        f"{name} is {one.title}. {executed_in_words(recording)}"
+        for name, one, recording in zip("AB", subjects, recordings, strict=True)
     )
     title = f"{subjects[0].task.name}: two policies"
     a, b = recordings
