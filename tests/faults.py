@@ -28,6 +28,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -276,30 +277,39 @@ class Campaign:
     def full_disk(self) -> None:
         """The disk is full in the midst of training; later there is room again."""
         folder = self.folder / "full disk"
-        with small_disk(folder, "400k") as kind:
-            process = Process(["run", *RUNS[SUBJECT], "checkpoint=0", "directory=run"], folder)
+        words = ["run", *RUNS[SUBJECT], "checkpoint=0", "directory=run"]
+        if not can_mount():
+            limit = 60_000
+            process = Process(
+                words, folder, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+            )
+            refused = process.wait() == 2 and "File too large" in process.line()
+            self.ends(f"no file above {limit:,} bytes (RLIMIT_FSIZE)", folder, refused, process)
+            return
+        with small_disk(folder, "400k"):
+            process = Process(words, folder)
             refused = process.wait() == 2 and "No space left on device" in process.line()
-            subprocess.run(["mount", "-o", "remount,size=64m", str(folder)], check=True)
-            self.ends(f"full disk ({kind})", folder, refused, process)
+            subprocess.run(["mount", "-o", "remount,size=64m", folder], check=True)
+            self.ends("full disk (tmpfs of 400k)", folder, refused, process)
 
     def read_only(self) -> None:
         """The place for checkpoints becomes read-only; later it can be written again."""
         folder, process = self.begin("read-only", 0.0)
         process.until_iterations(3)
-        with read_only(folder / "run" / "checkpoints") as kind:
-            refused = process.wait() == 2 and "Read-only" in process.line()
-            again = Process(["run", "resume=run"], folder)
-            refused &= again.wait() == 2
+        os.kill(process.pid, signal.SIGSTOP)
+        with read_only(folder / "run" / "checkpoints") as (kind, says):
+            os.kill(process.pid, signal.SIGCONT)
+            refused = process.wait() == 2 and says in process.line()
+            refused &= Process(["run", "resume=run"], folder).wait() == 2
         self.ends(f"read-only ({kind})", folder, refused, process)
 
     def read_only_from_the_start(self) -> None:
         folder = self.folder / "nowhere to write"
         folder.mkdir()
         elsewhere = self.folder / "somewhere"
-        with read_only(folder) as kind:
-            words = ["run", *RUNS[SUBJECT], f"directory={folder}/run"]
-            process = Process(words, elsewhere)
-            refused = process.wait() == 2 and "Read-only" in process.line()
+        with read_only(folder) as (kind, says):
+            process = Process(["run", *RUNS[SUBJECT], f"directory={folder}/run"], elsewhere)
+            refused = process.wait() == 2 and says in process.line()
         one_line = len(process.line().splitlines()) == 1
         self.check(f"read-only from the start ({kind})", refused and one_line, process.line())
 
@@ -328,7 +338,7 @@ class Campaign:
         folder, process = self.begin("no more memory", 0.0)
         process.until_iterations(3)
         before = iterations(folder)
-        limit = process.size()  # not a page more
+        limit = process.size() + (1 << 20)
         resource.prlimit(process.pid, resource.RLIMIT_AS, (limit, limit))
         refused = process.wait() == 2 and "out of memory" in process.line()
         self.ends(f"memory limit after {before} iterations", folder, refused, process)
@@ -479,26 +489,45 @@ def iterations(folder: Path) -> int:
     return metrics.read_text().count("\n") if metrics.exists() else 0
 
 
+@cache
+def can_mount() -> bool:
+    """Whether file systems can be mounted here, which takes root, and in a container more."""
+    with tempfile.TemporaryDirectory() as folder:
+        mount = ["mount", "-t", "tmpfs", "tmpfs", folder]
+        if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+            return False
+        subprocess.run(["umount", folder], check=True)
+    return True
+
+
 @contextmanager
-def small_disk(folder: Path, size: str) -> Iterator[str]:
+def small_disk(folder: Path, size: str) -> Iterator[None]:
     """A file system of that size."""
     folder.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder], check=True)
     try:
-        yield f"tmpfs of {size}"
+        yield
     finally:
         subprocess.run(["umount", folder], check=True)
 
 
 @contextmanager
-def read_only(folder: Path) -> Iterator[str]:
-    """A folder in which nothing can be written. Permissions do not bind root: it needs a mount."""
-    subprocess.run(["mount", "--bind", folder, folder], check=True)
-    try:
-        subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
-        yield "bind mount"
-    finally:
-        subprocess.run(["umount", folder], check=True)
+def read_only(folder: Path) -> Iterator[tuple[str, str]]:
+    """A folder in which nothing can be written: by a mount where one can, since permissions do not
+    bind root. Yields what was used, and what the system says."""
+    if can_mount():
+        subprocess.run(["mount", "--bind", folder, folder], check=True)
+        try:
+            subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
+            yield "bind mount", "Read-only file system"
+        finally:
+            subprocess.run(["umount", folder], check=True)
+    else:
+        folder.chmod(0o500)
+        try:
+            yield "permissions", "Permission denied"
+        finally:
+            folder.chmod(0o700)
 
 
 def main() -> int:
@@ -515,8 +544,13 @@ def main() -> int:
         if options.only != "faults":
             campaign.kill(options.kills)
         if options.only != "kills":
+            bound = can_mount() or os.geteuid() != 0
             for fault in FAULTS:
-                fault(campaign)
+                if bound or fault not in NEED_A_BOUND:
+                    fault(campaign)
+                else:
+                    name = fault.__name__.replace("_", " ")
+                    sys.stdout.write(f"left out, root may write and not mount: {name}\n")
     sys.stdout.write(f"{campaign.kills.total()} kills (seed {seed}):\n")
     for (name, stage), count in sorted(campaign.kills.items()):
         sys.stdout.write(f"  {count:3} in {name}: {stage}\n")
@@ -554,6 +588,7 @@ FAULTS = (
     Campaign.poisoned_model,
     Campaign.poisoned_numbers,
 )
+NEED_A_BOUND = (Campaign.read_only, Campaign.read_only_from_the_start)
 
 if __name__ == "__main__":
     sys.exit(main())

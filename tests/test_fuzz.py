@@ -88,7 +88,17 @@ def intact(
     ).save(folder)
     chosen = config.compose([f"task={NAME}", "budget=smoke"])
     (folder / "config.yaml").write_text(yaml.safe_dump(asdict(chosen)))
-    score = {"normalized_reward": 0.5, "optimality": 0.5, "success": 1.0}
+    score = {
+        "normalized_reward": 0.5,
+        "optimality": 0.5,
+        "success": 1.0,
+        "perturbed": {"episodes": 100, "success": 0.5, "violations": 0.0},
+        "robustness": {
+            "survival_100N": 0.5,
+            "impulse_50": 3.0,
+            "impulse_50_is_lower_bound": False,
+        },
+    }
     whose = {"task": NAME, "method": "twostage", "seed": 0, "budget": "smoke"}
     record.write_json(folder / "score.json", {**whose, "score": score})
     Checkpoints(folder / "checkpoints", pytest.fail).save(0, "plan", 1, {"values": np.ones(3)})

@@ -26,6 +26,7 @@ from tsbench.motion import ReferenceMotion
 from tsbench.policy import Policy
 from tsbench.rl.ppo import Learner, PPOSettings
 from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
 from tsbench.workspace import RunMonitor, RunWorkspace
@@ -188,20 +189,24 @@ def test_the_learner_goes_on_to_the_last_bit(
 ) -> None:
     """On every kind of stage, from what came back from the disk, in a fresh one of another seed."""
     trot, rocket = tasks.make("laikago_trot"), tasks.make("rocket_obstacles")
-    subjects = {
+    subjects: dict[str, Any] = {
         "kinematics": Planning(rocket, explore=0.5),
         "legs in kinematics": Planning(trot, explore=0.5),
         "flight": rocket,
         "imitation": Imitation(trot, naive_reference("laikago_trot")),
+        "disturbances": trot,
     }
+    disturb = Disturbances(push=80.0, interval=0.3, mass=0.2, friction=0.3, strength=0.1)
     chosen = PPOSettings(
         environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,), entropy=0.01,
         desired_kl=0.001, final_std=0.1,
     )  # fmt: skip
 
-    def learner(subject: Any, seed: int) -> Learner:
-        dynamics = subject
-        if not isinstance(subject, Planning):
+    def learner(name: str, seed: int) -> Learner:
+        subject = dynamics = subjects[name]
+        if name == "disturbances":  # which physics there are is part of the problem
+            dynamics = DisturbedPhysics(subject, chosen.environments, disturb, 0, threads=1)
+        elif not isinstance(subject, Planning):
             dynamics = Physics(subject, chosen.environments, threads=1)
         return Learner(BatchedEnvironment(subject, dynamics, 8, seed), chosen, seed)
 
@@ -210,11 +215,11 @@ def test_the_learner_goes_on_to_the_last_bit(
         learner.learn(5 * 128, lambda *_: taken.append(encode(learner.snapshot())))
         return taken
 
-    for name, subject in subjects.items():
-        whole = snapshots(learner(subject, 1))
+    for name in subjects:
+        whole = snapshots(learner(name, 1))
         rates = {decode(each)["learning_rate"] for each in whole}
         assert len(rates) > 1, "the adaptive learning rate has to take part"
-        second = learner(subject, 2)
+        second = learner(name, 2)
         second.restore(decode(whole[1]))
         assert second.steps == 2 * 128
         assert snapshots(second) == whole[2:], name

@@ -13,9 +13,12 @@ import numpy as np
 class TsbenchError(Exception):
     """A mistake that the user can mend.
 
-    The message is one line in plain words. The command line prints it after `tsbench: ` on the
-    error stream and exits with status 2; no traceback is shown.
+    The message is one line in plain words, even where it quotes what has several. The command line
+    prints it after `tsbench: ` on the error stream and exits with status 2; no traceback is shown.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.splitlines()))
 
 
 class NotFiniteError(TsbenchError):
@@ -77,8 +80,9 @@ def memory_errors() -> Iterator[None]:
     """Turns a refusal of memory, by Python, numpy, mujoco or torch, into one line."""
     try:
         yield
-    except (MemoryError, RuntimeError) as error:
-        # torch, and whoever cannot start a thread, raises a plain RuntimeError.
-        if isinstance(error, RuntimeError) and not any(sign in str(error) for sign in _NO_MEMORY):
+    except (MemoryError, RuntimeError, ValueError) as error:
+        # torch, and whoever cannot start a thread, raises a RuntimeError, mujoco a ValueError.
+        known = isinstance(error, MemoryError) or any(sign in str(error) for sign in _NO_MEMORY)
+        if not known:
             raise
         raise TsbenchError("out of memory: fewer environments need less") from None

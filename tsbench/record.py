@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from pathlib import Path
@@ -67,14 +68,19 @@ def read_score(directory: Path) -> dict[str, Any]:
         content = path.read_bytes()
     try:
         record = json.loads(content)
-        for name in ("task", "method", "seed", "budget"):
-            record[name]
-        for name in ("normalized_reward", "optimality", "success"):
-            if not isinstance(record["score"][name], (int, float)):
-                raise ValueError(f"{name} is no number")
+        score = record["score"]
+        _ = [record[name] for name in ("task", "method", "seed", "budget")]
+        needed = [score[name] for name in ("normalized_reward", "optimality", "success")]
+        needed += [score["perturbed"][name] for name in ("episodes", "success", "violations")]
+        if robustness := score.get("robustness"):
+            needed += [robustness[name] for name in ("survival_100N", "impulse_50")]
+            needed.append(robustness["impulse_50_is_lower_bound"])
+        for value in needed:
+            if not (isinstance(value, (int, float)) and math.isfinite(value)):
+                raise ValueError(f"{value!r} where a number should be")
     except KeyError as error:
         raise TsbenchError(f"damaged score {path}: {error} is missing") from None
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise TsbenchError(f"damaged score {path}: {error}") from None
     return dict(record)
 
