@@ -231,10 +231,11 @@ class Campaign:
             while True:
                 begun = (folder / "run" / "config.yaml").exists()
                 process = Process(["run", "resume=run"] if begun else words, folder)
-                if killed == KILLS or self.kills.total() == count:
+                done = iterations(folder)
+                over = killed > 0 and done == total  # one kill after the training is enough
+                if over or killed == KILLS or self.kills.total() == count:
                     process.wait()
                     break
-                done = iterations(folder)
                 target = self.random.randint(min(done + 1, total), total)
                 if not process.until_iterations(target):
                     break
