@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -349,6 +350,8 @@ def _view(words: Sequence[str]) -> None:
     running = serve.server(lambda push: page.render(show(push), served=True), options.port)
     sys.stdout.write(f"{serve.address(running, options.push)} (Ctrl-C ends it)\n")
     sys.stdout.flush()
+    # A shell lets what it starts in the background ignore Ctrl-C; a server must still end by it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with running, suppress(KeyboardInterrupt):
         running.serve_forever()
 

@@ -83,14 +83,19 @@ def test_the_command_says_where_and_ends_at_ctrl_c(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # As a shell starts what it puts in the background: with Ctrl-C ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     ) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        found = re.match(r"(http://127\.0\.0\.1:\d+/\?push=60N%400\.5s%3A%2By) \(Ctrl-C", line)
-        assert found, line
-        status, text = fetch(found[1])
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            found = re.match(r"(http://127\.0\.0\.1:\d+/\?push=60N%400\.5s%3A%2By) \(Ctrl-C", line)
+            assert found, line
+            status, text = fetch(found[1])
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()  # or leaving the context would wait for it
     assert (status, process.returncode, errors) == (200, 0, "")
     assert "<b>push</b>" in text  # the legend
     assert '"served": true' in text
