@@ -2,9 +2,8 @@
 
 The physics runs on `mujoco.batch`, which steps every simulation on a pool of threads that is as
 wide as the machine and then brings position and velocity sensors up to date. The bare
-`mujoco.rollout` leaves them one substep behind, and mending that takes an extra step. With
-observations, rewards and resets this does 0.91 of the bare rollout's control steps per second on
-Laikago, two cores (`tsbench bench`).
+`mujoco.rollout` leaves them one substep behind, and mending that takes an extra step.
+docs/speed.md says how near the whole comes to the bare rollout.
 """
 
 from __future__ import annotations

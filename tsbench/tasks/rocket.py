@@ -394,8 +394,8 @@ class Rocket(Task[RocketState]):
         sparse when the goal is far. Without the exponential the last metres are worth about 1 %
         each, less than what leaving a steady hover costs, and without the pay for advancing the
         same holds on the way: policies stop some metres short, or are slow (docs/calibration.md).
-        What a detour gains it loses again, so the pay changes no policy's rank (Ng et al. 1999,
-        potential-based shaping, without the discount).
+        What going back loses, going forth gains again: to and fro does not pay. To arrive sooner
+        does, so policies fly faster than the plan.
         """
         form = self.imitation_form(form)
         remaining = np.linalg.norm(reference.qpos[:, :2] - self.goal, axis=-1)
