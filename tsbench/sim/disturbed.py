@@ -21,9 +21,9 @@ class Disturbances:
     """What is random, all of it uniform; zeros disturb nothing.
 
     Attributes:
-        push: newtons at most, on the body that the task lets be pushed, at any heading. That is in
-            the last environment; the bound falls evenly to none in the first, so that there is
-            always something to learn from.
+        push: newtons at most, on the body that the task lets be pushed, at any heading.
+        rise: environment steps over which that bound grows evenly from none to `push`: who is
+            pushed over from the first step on learns nothing.
         interval: seconds from push to push. The first comes at random within one.
         duration: of a push in seconds.
         mass: largest change of all masses, as a share, up or down; of each environment its own.
@@ -32,6 +32,7 @@ class Disturbances:
     """
 
     push: float = 0.0
+    rise: int = 0
     interval: float = 1.0
     duration: float = 0.1
     mass: float = 0.0
@@ -41,6 +42,8 @@ class Disturbances:
     def __post_init__(self) -> None:
         if not 0.0 <= self.push < math.inf:
             raise ValueError(f"disturb.push must not be negative, not {self.push}")
+        if self.rise < 0:
+            raise ValueError(f"disturb.rise must not be negative, not {self.rise}")
         if not 0.0 < self.duration <= self.interval < math.inf:
             raise ValueError("disturb.duration must be positive and at most disturb.interval")
         for name in ("mass", "friction", "strength"):
@@ -69,7 +72,6 @@ class DisturbedPhysics(Physics[S]):
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
         self._first = np.zeros(count)  # seconds into the episode
         self._forces = np.zeros((count, pushes, 3))
-        self._strongest = np.linspace(0.0, disturbances.push, count)
         self._axes = np.array(task.push_plane)
         rng = np.random.default_rng(seed)
         bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
@@ -88,10 +90,14 @@ class DisturbedPhysics(Physics[S]):
     def _draw(self, rng: Rng, rows: np.ndarray) -> None:
         shape = (len(rows), self._forces.shape[1])
         heading = rng.uniform(0.0, 2.0 * math.pi, shape)
-        size = rng.uniform(0.0, 1.0, shape) * self._strongest[rows, None]
+        size = rng.uniform(0.0, 1.0, shape) * self._strongest()
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1) @ self._axes
         self._forces[rows] = size[..., None] * direction
         self._first[rows] = rng.uniform(0.0, self.disturbances.interval, len(rows))
+
+    def _strongest(self) -> float:
+        steps, rise = self.substeps / self.task.substeps, self.disturbances.rise
+        return self.disturbances.push * (1.0 if steps >= rise else steps / rise)
 
     def snapshot(self) -> dict[str, Any]:
         return {**super().snapshot(), "first": self._first, "forces": self._forces}
