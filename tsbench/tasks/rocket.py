@@ -52,7 +52,9 @@ TRACKING_DECAY = -0.625  # k_imi (P)
 COLLISION_PENALTY = 0.25  # (P)
 ARRIVAL_LENGTH = 4.0  # m, over which arriving is felt (D)
 ADVANCE_WORTH = 1.0  # per metre that a step brings along the reference (C)
-ADVANCE_LIMIT = 0.5  # m a step: free fall at full thrust, 25 m/s, comes no further
+# m a step (C): going faster than 10 m/s, twice the plan's speed, earns no more: such rockets
+# tumble when they brake. Going back costs what it costs: no rocket does 25 m/s.
+ADVANCE_LIMITS = (-0.5, 0.2)
 
 DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
 MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
@@ -390,12 +392,12 @@ class Rocket(Task[RocketState]):
         `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
         `progress` (default): the same with the sparse R replaced by
         0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 4 m), where s of the path's length L lies before
-        xbar, and 1 for each metre by which the step raised s (D). The printed form is itself
-        sparse when the goal is far. Without the exponential the last metres are worth about 1 %
-        each, less than what leaving a steady hover costs, and without the pay for advancing the
-        same holds on the way: policies stop some metres short, or are slow (docs/calibration.md).
-        What going back loses, going forth gains again: to and fro does not pay. To arrive sooner
-        does, so policies fly faster than the plan.
+        xbar, and 1 for each metre by which the step raised s, up to 0.2 m (D). The printed form is
+        itself sparse when the goal is far. Without the exponential the last metres are worth about
+        1 % each, less than what leaving a steady hover costs, and without the pay for advancing
+        the same holds on the way: policies stop some metres short, or are slow. With pay for any
+        speed they come in too fast to stop (docs/calibration.md). Going forth gains at most what
+        going back has lost: to and fro does not pay.
         """
         form = self.imitation_form(form)
         remaining = np.linalg.norm(reference.qpos[:, :2] - self.goal, axis=-1)
@@ -414,7 +416,7 @@ class Rocket(Task[RocketState]):
             remaining = (1.0 - progress) * length
             worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / ARRIVAL_LENGTH)
             advance = (progress - path.project(previous.position)[1]) * length
-            advance = xp.clip(advance, -ADVANCE_LIMIT, ADVANCE_LIMIT)
+            advance = xp.clip(advance, *ADVANCE_LIMITS)
             return closeness * worth + ADVANCE_WORTH * advance - penalty
 
         def start(rng: Rng, count: int) -> Start:
@@ -432,7 +434,7 @@ class Rocket(Task[RocketState]):
 
         return Tracker(
             reward=reward,
-            max_reward=GOAL_WEIGHT if form == "paper" else 1.0 + ADVANCE_WORTH * ADVANCE_LIMIT,
+            max_reward=GOAL_WEIGHT if form == "paper" else 1.0 + ADVANCE_WORTH * ADVANCE_LIMITS[1],
             terminal=self.terminal,
             start=start,
             horizon=self.horizon,
