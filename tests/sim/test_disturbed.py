@@ -135,6 +135,6 @@ def test_every_environment_has_its_own_physics_for_good() -> None:
         ({"friction": -0.1}, r"disturb.friction must lie in \[0, 1\)"),
     ],
 )
-def test_values_that_make_no_sense(wrong: dict[str, float], message: str) -> None:
+def test_values_that_make_no_sense(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Disturbances(**wrong)
