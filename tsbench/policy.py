@@ -47,8 +47,8 @@ def _symlog(x: np.ndarray) -> np.ndarray:
 
 
 # What is done to observations before they are normalised. Where some range over tens of metres and
-# centimetres still matter, as a rocket's way to its goal, `symlog` (Hafner et al. 2023, DreamerV3)
-# spreads the small values apart; a linear scale would leave them to a tenth of the network's input.
+# decimetres still matter, as a rocket's way to its goal, `symlog` (Hafner et al. 2023, DreamerV3)
+# spreads the small values apart.
 ENCODINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"plain": _plain, "symlog": _symlog}
 
 

@@ -43,7 +43,7 @@ from tsbench.sim.tracking import Imitation
 from tsbench.workspace import RunWorkspace
 
 LEARNING_RATE = 3e-4  # Stable-Baselines3's own
-PATIENCE = 10.0  # times our time, after which it has failed
+PATIENCE = 6.0  # times our time, after which it has failed
 CHECKS = 40  # of its policy while it uses our number of steps
 
 
