@@ -117,7 +117,7 @@ def test_foreign_references_are_refused(
 def test_form(naive_reference: Callable[[str], ReferenceMotion]) -> None:
     name = "rocket_navigation"
     task, reference = tasks.make(name), naive_reference(name)
-    assert Imitation(task, reference).max_reward == 1.5
+    assert Imitation(task, reference).max_reward == 1.2
     assert Imitation(task, reference, "paper").max_reward == 0.9
     with pytest.raises(TsbenchError, match="allowed: paper, progress"):
         Imitation(task, reference, "deepmimic")
