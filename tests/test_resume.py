@@ -196,7 +196,9 @@ def test_the_learner_goes_on_to_the_last_bit(
         "imitation": Imitation(trot, naive_reference("laikago_trot")),
         "disturbances": trot,
     }
-    disturb = Disturbances(push=80.0, rise=400, interval=0.3, mass=0.2, friction=0.3, strength=0.1)
+    disturb = Disturbances(
+        push=80.0, rise=400, calm=0.2, interval=0.3, mass=0.2, friction=0.3, strength=0.1
+    )
     chosen = PPOSettings(
         environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,), entropy=0.01,
         desired_kl=0.001, final_std=0.1,

@@ -110,6 +110,25 @@ def test_pushes_grow_over_the_first_steps() -> None:
         assert 0.9 * bound < largest() <= bound
 
 
+def test_some_episodes_are_calm() -> None:
+    """Three tenths of them meet no push at all, and those change from episode to episode."""
+    task = tasks.make("rocket_navigation")
+    disturbances = Disturbances(push=20.0, calm=0.3, interval=0.5)
+    physics = DisturbedPhysics(task, 1000, disturbances, 0, threads=1)
+    rng, rows = np.random.default_rng(0), np.arange(1000)
+
+    def calm() -> np.ndarray:
+        state = physics.begin(rng, rows)
+        times = state.time + 0.1 * np.arange(20)[:, None]
+        sizes = [np.linalg.norm(physics.push_force(t, slice(None)), axis=-1) for t in times]
+        return ~np.any(sizes, axis=0)
+
+    first, second = calm(), calm()
+    for found in (first, second):
+        assert 0.25 < found.mean() < 0.35  # three standard deviations are 0.043
+    assert 0.05 < (first & second).mean() < 0.13
+
+
 def test_every_environment_has_its_own_physics_for_good() -> None:
     task = tasks.make("rocket_navigation")
     physics = DisturbedPhysics(task, 8, Disturbances(mass=0.3), 5, threads=1)
@@ -130,6 +149,7 @@ def test_every_environment_has_its_own_physics_for_good() -> None:
     [
         ({"push": -1.0}, "disturb.push must not be negative"),
         ({"rise": -1}, "disturb.rise must not be negative"),
+        ({"calm": 1.0}, r"disturb.calm must lie in \[0, 1\)"),
         ({"duration": 2.0}, "at most disturb.interval"),
         ({"mass": 1.0}, r"disturb.mass must lie in \[0, 1\)"),
         ({"friction": -0.1}, r"disturb.friction must lie in \[0, 1\)"),

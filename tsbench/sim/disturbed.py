@@ -24,6 +24,7 @@ class Disturbances:
         push: newtons at most, on the body that the task lets be pushed, at any heading.
         rise: environment steps over which that bound grows evenly from none to `push`: who is
             pushed over from the first step on learns nothing.
+        calm: share of the episodes without a push: what is judged first is the task as it is.
         interval: seconds from push to push. The first comes at random within one.
         duration: of a push in seconds.
         mass: largest change of all masses, as a share, up or down; of each environment its own.
@@ -33,6 +34,7 @@ class Disturbances:
 
     push: float = 0.0
     rise: int = 0
+    calm: float = 0.0
     interval: float = 1.0
     duration: float = 0.1
     mass: float = 0.0
@@ -46,7 +48,7 @@ class Disturbances:
             raise ValueError(f"disturb.rise must not be negative, not {self.rise}")
         if not 0.0 < self.duration <= self.interval < math.inf:
             raise ValueError("disturb.duration must be positive and at most disturb.interval")
-        for name in ("mass", "friction", "strength"):
+        for name in ("calm", "mass", "friction", "strength"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"disturb.{name} must lie in [0, 1), not {getattr(self, name)}")
 
@@ -91,6 +93,7 @@ class DisturbedPhysics(Physics[S]):
         shape = (len(rows), self._forces.shape[1])
         heading = rng.uniform(0.0, 2.0 * math.pi, shape)
         size = rng.uniform(0.0, 1.0, shape) * self._strongest()
+        size *= rng.uniform(0.0, 1.0, (len(rows), 1)) >= self.disturbances.calm
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1) @ self._axes
         self._forces[rows] = size[..., None] * direction
         self._first[rows] = rng.uniform(0.0, self.disturbances.interval, len(rows))
