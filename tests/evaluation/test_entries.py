@@ -56,6 +56,8 @@ def test_an_entry_repeats(entry: Path) -> None:
     same_machine = again["origin"]["packages"] == score["origin"]["packages"] and (
         again["origin"]["machine"] == score["origin"]["machine"]
     )
+    for name in ("task_version", "constants", "model"):  # else it is never compared again
+        assert again["origin"][name] == score["origin"][name]
     if again["origin"]["packages"]["mujoco"] == score["origin"]["packages"]["mujoco"]:
         assert replay(task, starts, log)
     if same_machine:

@@ -67,13 +67,22 @@ def test_what_a_score_says_of_its_origin(kept: Any) -> None:
 
 
 def test_the_constants_hash(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It changes with the task's own constants and with the numbers in its file."""
+    """It changes with the task's own constants and with the numbers in its file that a score
+    depends on."""
     before = constants_hash(TASK)
     assert before == constants_hash(tasks.make("laikago_trot", distance=0.4))
     assert before != constants_hash(tasks.make("laikago_trot"))
     assert before != constants_hash(tasks.make("laikago_walk", distance=0.4))
-    monkeypatch.setattr("tsbench.tasks.laikago.SLIP_DECAY", -11.0)
-    assert before != constants_hash(TASK)
+    for name, value in (("SLIP_DECAY", -11.0), ("FILTER_B", (0.1, 0.2, 0.1))):
+        with monkeypatch.context() as changed:
+            changed.setattr(f"tsbench.tasks.laikago.{name}", value)
+            assert before != constants_hash(TASK)
+    rocket = tasks.make("rocket_navigation")
+    before = constants_hash(rocket)
+    monkeypatch.setattr("tsbench.tasks.rocket.TRACKING_DECAY", -1.0)
+    assert before == constants_hash(rocket)
+    monkeypatch.setattr("tsbench.tasks.rocket.DEAD_ZONE", 0.4)
+    assert before != constants_hash(rocket)
 
 
 def test_bit_for_bit(kept: Any, score: Score, starts: Start) -> None:

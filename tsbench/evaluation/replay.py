@@ -87,15 +87,22 @@ def machine() -> dict[str, str]:
 
 
 def constants_hash(task: Task[Any]) -> str:
-    """sha256 of a task's own constants and of the numbers that its file defines."""
+    """sha256 of a task's own constants and of the numbers that its file defines, but for those
+    named TRACKING_...: by the reward for imitating, nothing is judged."""
     module = vars(sys.modules[type(task).__module__])
     numbers = {
         name: value
         for name, value in module.items()
-        if name.isupper() and isinstance(value, (int, float, np.ndarray))
+        if name.isupper() and not name.startswith("TRACKING_") and _numeric(value)
     }
     content = json.dumps([task.constants(), numbers], sort_keys=True, default=_plain)
     return hashlib.sha256(content.encode()).hexdigest()
+
+
+def _numeric(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(_numeric(part) for part in value)
+    return isinstance(value, (int, float, np.ndarray))
 
 
 def _plain(value: Any) -> Any:

@@ -48,13 +48,14 @@ PLAN_TIMESTEP = 1 / 20  # s (P)
 PLAN_STEP = 0.25  # m per axis and plan step (P)
 PLAN_TURN = 0.05  # rad per plan step (P prints degrees; D: see spec section 1)
 
+# Of the imitation reward; no score depends on them.
 TRACKING_DECAY = -0.625  # k_imi (P)
-COLLISION_PENALTY = 0.25  # (P)
-ARRIVAL_LENGTH = 4.0  # m, over which arriving is felt (D)
-ADVANCE_WORTH = 1.0  # per metre that a step brings along the reference (C)
+TRACKING_PENALTY = 0.25  # of a collision (P)
+TRACKING_ARRIVAL = 4.0  # m, over which arriving is felt (D)
+TRACKING_ADVANCE = 1.0  # per metre that a step brings along the reference (C)
 # m a step (C): going faster than 10 m/s, twice the plan's speed, earns no more: such rockets
 # tumble when they brake. Going back costs what it costs: no rocket does 25 m/s.
-ADVANCE_LIMITS = (-0.5, 0.2)
+TRACKING_LIMITS = (-0.5, 0.2)
 
 DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
 MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
@@ -408,16 +409,16 @@ class Rocket(Task[RocketState]):
             xp = array_namespace(state.position)
             distance, progress = path.project(state.position)
             collision = xp.astype(self.violated(state), state.position.dtype)
-            penalty = COLLISION_PENALTY * collision
+            penalty = TRACKING_PENALTY * collision
             closeness = xp.exp(TRACKING_DECAY * distance)
             if form == "paper":
                 return closeness * self.reward(previous, action, state) - penalty
             length = path.lengths[-1]
             remaining = (1.0 - progress) * length
-            worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / ARRIVAL_LENGTH)
+            worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / TRACKING_ARRIVAL)
             advance = (progress - path.project(previous.position)[1]) * length
-            advance = xp.clip(advance, *ADVANCE_LIMITS)
-            return closeness * worth + ADVANCE_WORTH * advance - penalty
+            advance = xp.clip(advance, *TRACKING_LIMITS)
+            return closeness * worth + TRACKING_ADVANCE * advance - penalty
 
         def start(rng: Rng, count: int) -> Start:
             # More often near the goal, where to stay pays and an early policy does not get.
@@ -432,9 +433,10 @@ class Rocket(Task[RocketState]):
             time = np.where(first, 0.0, frames * reference.timestep)
             return Start(time, qpos, qvel, from_start.memory)
 
+        best = TRACKING_ADVANCE * TRACKING_LIMITS[1]
         return Tracker(
             reward=reward,
-            max_reward=GOAL_WEIGHT if form == "paper" else 1.0 + ADVANCE_WORTH * ADVANCE_LIMITS[1],
+            max_reward=GOAL_WEIGHT if form == "paper" else 1.0 + best,
             terminal=self.terminal,
             start=start,
             horizon=self.horizon,
