@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +16,9 @@ from tsbench.bench.training import split
 from tsbench.bench.turns import Case, Effort, Range, take_turns
 from tsbench.cli import main
 from tsbench.errors import TsbenchError
+from tsbench.motion import ReferenceMotion
+from tsbench.rl.ppo import PPOSettings
+from tsbench.sim.tracking import Imitation
 
 TINY = Effort(repeats=2, seconds=0.01, count=6, counts=(1, 3), iterations=1, budget="smoke")
 PARTS = ("physics", "mdp", "inference", "update", "records")
@@ -58,6 +62,30 @@ def test_what_is_written_is_what_was_measured(
     shown = capsys.readouterr().out
     assert "rocket.batched/rollout" in shown
     assert result["machine"]["mujoco"] in shown
+
+
+def test_the_rival_is_given_our_settings(
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    """Stable-Baselines3 with our network, encoding and falling learning rate."""
+    pytest.importorskip("stable_baselines3")
+    name = "rocket_navigation"
+    imitation = Imitation(tasks.make(name), naive_reference(name))
+    chosen = PPOSettings(
+        environments=2, rollout=8, epochs=1, minibatches=2, hidden=(5, 4), activation="elu",
+        encoding="symlog", desired_kl=None, learning_rate=1e-3, final_learning_rate=1e-5,
+    )  # fmt: skip
+    rival = sb3.Rival(imitation, chosen, 0, steps=32)
+    actor = rival.model.policy.mlp_extractor.policy_net
+    assert [type(layer).__name__ for layer in actor] == ["Linear", "ELU", "Linear", "ELU"]
+    assert [layer.out_features for layer in actor[::2]] == [5, 4]
+    rates = []
+    for _ in range(3):  # sixteen steps each
+        rival.model.learn(16, reset_num_timesteps=False)
+        rates.append(rival.model.policy.optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-4, 1e-5, 1e-5])
+    far = np.full((1, imitation.observation_size), 1e6)
+    assert np.all(np.isfinite(rival(far)))
 
 
 def test_a_missing_package_is_named_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ ROOT = Path(tsbench.__file__).parent
 MAY_KNOW: dict[str, set[str]] = {
     "errors": set(),
     "gl": {"errors"},
-    "curves": set(),
+    "curves": {"errors"},
     "conf": set(),
     "files": set(),
     "planning": {"errors"},
@@ -50,8 +50,8 @@ MAY_KNOW: dict[str, set[str]] = {
     },
     "launch": {"errors", "config", "record", "run"},
     "bench": {
-        "errors", "mdp", "motion", "problem", "sim", "tasks", "rl", "methods", "config", "record",
-        "workspace", "run",
+        "errors", "mdp", "motion", "policy", "problem", "sim", "tasks", "rl", "methods", "config",
+        "record", "workspace", "run",
     },
 }  # fmt: skip
 ROOFS = {"cli", "gym", "tsbench"}  # the commands and the public faces: they may know everything

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from tsbench.errors import TsbenchError
+
 MEASURE = "episode_return"
 
 
@@ -15,14 +17,20 @@ def figure(metrics: Path) -> Figure | None:
 
     Args:
         metrics: a run's `metrics.jsonl`; without returns in it there is nothing to draw.
+
+    Raises:
+        TsbenchError: the file is damaged.
     """
     curves: dict[str, tuple[list[int], list[float]]] = {}
     for line in metrics.read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
-        if MEASURE in row:
-            steps, returns = curves.setdefault(row["stage"], ([], []))
-            steps.append(row["steps"])
-            returns.append(row[MEASURE])
+        try:
+            row = json.loads(line)
+            if MEASURE in row:
+                steps, returns = curves.setdefault(row["stage"], ([], []))
+                steps.append(row["steps"])
+                returns.append(row[MEASURE])
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise TsbenchError(f"damaged metrics {metrics}: {error}") from None
     if not curves:
         return None
     drawn = Figure(figsize=(4.5 * len(curves), 3.2), layout="constrained")

@@ -4,8 +4,9 @@ Ours trains in two stages with budget=fast, to its end. Stable-Baselines3 then l
 the same reference motion, until its deterministic policy scores as much from the task's own start;
 that it stops there, and that its plan is a gift, are in its favour. Its settings are ours wherever
 it has them: networks, environments, steps between updates, epochs, minibatches, discounts,
-clipping, entropy, spread; observations are normalised by its VecNormalize. Where ours adapts the
-learning rate to a KL divergence, it keeps its default of 3e-4. Its environments are those of
+clipping, entropy, first spread, a falling learning rate; observations are encoded as ours and
+normalised by its VecNormalize. It has no bound for the spread, and where ours adapts the learning
+rate to a KL divergence, it keeps its default of 3e-4. Its environments are those of
 `tsbench.sim.gym` in one process, its default: on two cores a loop was faster than processes (the
 `loop` and `async` figures). Torch has one thread in both. Judging policies is not timed.
 """
@@ -21,7 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
+from gymnasium.wrappers import TransformObservation
 from rich.console import Console
 
 from tsbench import methods
@@ -30,6 +33,7 @@ from tsbench.bench.turns import Effort, Range
 from tsbench.config import compose
 from tsbench.mdp import Task
 from tsbench.motion import ReferenceMotion
+from tsbench.policy import ENCODINGS
 from tsbench.problem import Problem
 from tsbench.record import REFERENCE
 from tsbench.rl.ppo import PPOSettings
@@ -44,6 +48,7 @@ from tsbench.workspace import RunWorkspace
 
 LEARNING_RATE = 3e-4  # Stable-Baselines3's own
 PATIENCE = 6.0  # times our time, after which it has failed
+MODULES = {"elu": "ELU", "relu": "ReLU", "tanh": "Tanh"}  # activations in torch.nn
 CHECKS = 40  # of its policy while it uses our number of steps
 
 
@@ -86,7 +91,7 @@ def compare(name: str, effort: Effort) -> Findings:
         ours = train(problem, Path(folder))
         reference = ReferenceMotion.load(Path(folder) / REFERENCE)
     imitation = Imitation(problem.task, reference)
-    theirs = Rival(imitation, settings(problem, "imitate"), problem.seed)
+    theirs = Rival(imitation, settings(problem, "imitate"), problem.seed, ours.steps)
     outcome = theirs.learn(ours, judge(problem.task))
     arrived = "" if outcome.score >= ours.score else " (at least: it did not get there)"
     ratio = outcome.seconds / ours.seconds
@@ -131,17 +136,38 @@ def train(problem: Problem, folder: Path) -> Outcome:
 
 
 class Rival:
-    """Stable-Baselines3's PPO in an imitation variant."""
+    """Stable-Baselines3's PPO in an imitation variant.
 
-    def __init__(self, imitation: Imitation[Any], chosen: PPOSettings, seed: int) -> None:
+    Attributes:
+        model: it.
+    """
+
+    def __init__(
+        self, imitation: Imitation[Any], chosen: PPOSettings, seed: int, steps: int
+    ) -> None:
+        """`steps` are those over which a learning rate falls."""
         # The package is an extra: it is looked for when it is needed.
         vectors: Any = importlib.import_module("stable_baselines3.common.vec_env")
-        environments = [lambda: GymEnvironment(environment(imitation))] * chosen.environments
+        torch_nn: Any = importlib.import_module("torch.nn")
+        self._encode = ENCODINGS[chosen.encoding]
+
+        def make() -> gymnasium.Env[Any, Any]:
+            plain = GymEnvironment(environment(imitation))
+            return TransformObservation(plain, self._encode, plain.observation_space)
+
+        def rate(_: float) -> float:
+            if chosen.desired_kl is not None:
+                return LEARNING_RATE
+            final = chosen.final_learning_rate or chosen.learning_rate
+            share = min(self.model.num_timesteps / steps, 1.0)
+            return float(chosen.learning_rate * (final / chosen.learning_rate) ** share)
+
+        environments = [make] * chosen.environments
         self._vector = vectors.VecNormalize(vectors.DummyVecEnv(environments), norm_reward=False)
-        self._ppo = importlib.import_module("stable_baselines3").PPO(
+        self.model = importlib.import_module("stable_baselines3").PPO(
             "MlpPolicy",
             self._vector,
-            learning_rate=LEARNING_RATE,
+            learning_rate=chosen.learning_rate,
             n_steps=chosen.rollout,
             batch_size=chosen.environments * chosen.rollout // chosen.minibatches,
             n_epochs=chosen.epochs,
@@ -153,25 +179,27 @@ class Rival:
             max_grad_norm=chosen.gradient_norm,
             policy_kwargs={
                 "net_arch": list(chosen.hidden),
+                "activation_fn": getattr(torch_nn, MODULES[chosen.activation]),
                 "log_std_init": math.log(chosen.initial_std),
             },
             seed=seed,
             device="cpu",
         )
+        self.model.lr_schedule = rate
 
     def learn(self, ours: Outcome, score: Judge) -> Outcome:
         """Until it scores as ours does, or has taken `PATIENCE` times as long."""
         seconds = 0.0
         while True:
             began = time.perf_counter()
-            self._ppo.learn(ours.steps // CHECKS, reset_num_timesteps=False)
+            self.model.learn(ours.steps // CHECKS, reset_num_timesteps=False)
             seconds += time.perf_counter() - began
             reached, solved = score(self)
             if reached >= ours.score or seconds > PATIENCE * ours.seconds:
                 self._vector.close()
-                return Outcome(reached, solved, seconds, int(self._ppo.num_timesteps))
+                return Outcome(reached, solved, seconds, int(self.model.num_timesteps))
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        normalised = self._vector.normalize_obs(observation)
-        action: np.ndarray = self._ppo.predict(normalised, deterministic=True)[0]
+        normalised = self._vector.normalize_obs(self._encode(observation))
+        action: np.ndarray = self.model.predict(normalised, deterministic=True)[0]
         return action
