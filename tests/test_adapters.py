@@ -107,6 +107,15 @@ def test_evaluate_takes_a_function() -> None:
         tsbench.evaluate("nowhere", "rocket_navigation")
 
 
+def test_evaluate_takes_a_model_that_is_there(baseline: tuple[Path, PPO]) -> None:
+    score = tsbench.evaluate(baseline[1], "rocket_navigation", protocol="smoke", threads=1)
+    loaded = adapters.from_sb3(baseline[0], "PPO", TASK)
+    same = tsbench.evaluate(loaded, "rocket_navigation", protocol="smoke", threads=1)
+    assert score.nominal == same.nominal
+    with pytest.raises(TsbenchError, match="a model, a file or a function, not int"):
+        tsbench.evaluate(3, "rocket_navigation", protocol="smoke")
+
+
 @pytest.mark.parametrize("rows", [1, "n"])
 def test_onnx(rows: Any, tmp_path: Path) -> None:
     policy = adapters.load(write_onnx(tmp_path / "p.onnx", rows=rows), TASK)
@@ -122,6 +131,8 @@ def test_onnx(rows: Any, tmp_path: Path) -> None:
 def test_onnx_files_that_do_not_fit(tmp_path: Path) -> None:
     with pytest.raises(TsbenchError, match=r"not one input \(n, 10\) for rocket_navigation"):
         adapters.load(write_onnx(tmp_path / "p.onnx", inputs=11), TASK)
+    with pytest.raises(TsbenchError, match=r"takes tensor\(float\) \[4, 10\], not one input"):
+        adapters.load(write_onnx(tmp_path / "r.onnx", rows=4), TASK)
     (tmp_path / "q.onnx").write_bytes(b"nonsense")
     with pytest.raises(TsbenchError, match="damaged ONNX file"):
         adapters.load(tmp_path / "q.onnx", TASK)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tsbench import cli, methods, tasks
+from tsbench import cli, config, methods, tasks
 
 TASK = "task=rocket_navigation"
 
@@ -70,6 +70,17 @@ def test_list_is_the_same_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[
     for name, summary in content["methods"].items():
         assert name in shown
         assert summary
+
+
+def test_list_shows_tasks_without_a_configuration(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever adds a task writes that file last."""
+    known = config.names("task")
+    monkeypatch.setattr(config, "names", lambda _: known[1:])
+    assert cli.main(["list"]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if known[0] in line)
+    assert row.count("-") == 3
 
 
 def test_list_is_quick_because_it_leaves_learning_alone() -> None:

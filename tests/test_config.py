@@ -87,7 +87,7 @@ def test_words_change_values_and_open_mappings_need_no_plus() -> None:
         ([TASK, "seed=???"], "Missing mandatory value: seed"),
         ([TASK, "seed=1,2"], "seed=1,2 asks for several runs: add -m for a sweep"),
         ([TASK, "rubbish"], "cannot read 'rubbish': expected key=value"),
-        ([TASK, "seed=["], "cannot read 'seed=[': expected key=value"),
+        ([TASK, "seed=["], "cannot read 'seed=[': expected key=value, the value quoted where"),
     ],
 )
 def test_a_mistake_gets_one_line(words: list[str], line: str) -> None:

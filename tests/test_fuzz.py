@@ -97,10 +97,17 @@ def intact(
             "survival_100N": 0.5,
             "impulse_50": 3.0,
             "impulse_50_is_lower_bound": False,
+            "surface": {
+                "forces_N": [9.0],
+                "headings_rad": [0.0, 3.0],
+                "phases": [4],
+                "survived": [[[1], [0]]],
+            },
         },
     }
+    stage = {"name": "plan", "steps": 8, "physics_substeps": 0, "seconds": 0.5}
     whose = {"task": NAME, "method": "twostage", "seed": 0, "budget": "smoke"}
-    record.write_json(folder / "score.json", {**whose, "score": score})
+    record.write_json(folder / "score.json", {**whose, "score": score, "stages": [stage]})
     Checkpoints(folder / "checkpoints", pytest.fail).save(0, "plan", 1, {"values": np.ones(3)})
     return folder
 

@@ -161,7 +161,13 @@ def test_a_used_directory_is_refused_and_stays(finished: Path) -> None:
 def test_evaluate_repeats_the_score(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["evaluate", "one", "--json", "again.json"]) == 0
     assert "one/score.json: compared bit for bit: equal" in capsys.readouterr().out
-    assert json.loads(Path("again.json").read_text()) == record.read_score(finished)["score"]
+    shown = json.loads(Path("again.json").read_text())
+    comparison = shown.pop("comparison")
+    assert comparison == {
+        "kind": "exact", "agrees": True, "words": "compared bit for bit: equal",
+    }  # fmt: skip
+    assert shown == record.shown(record.read_score(finished))
+    assert {"normalized_reward", "robustness", "stages"} <= shown.keys()
 
 
 def test_evaluate_needs_the_policy_file_alone(
@@ -182,7 +188,7 @@ def test_evaluate_says_when_a_score_is_not_what_the_policy_earns(
     content = record.read_score(finished)
     content["score"]["normalized_reward"] = 0.99
     (finished / "score.json").write_text(json.dumps(content))
-    assert cli.main(["evaluate", "one"]) == 0
+    assert cli.main(["evaluate", "one"]) == 1
     assert "one/score.json: compared bit for bit: DIFFERENT" in capsys.readouterr().out
 
 
@@ -231,10 +237,52 @@ def test_view_writes_a_page_once(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.usefixtures("finished")
+def test_view_refuses_a_plan_that_does_not_fit(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = Plan.load("one/plan.npz")
+    replace(plan, states=plan.states[:, :2]).save("narrow.npz")
+    replace(plan, task_version=7).save("later.npz")
+    assert cli.main(["view", "narrow.npz", "--html", "x.html"]) == 2
+    assert "the plan has 2 states a step, not 3" in capsys.readouterr().err
+    assert cli.main(["view", "later.npz", "--html", "x.html"]) == 2
+    assert "for rocket_navigation version 7, not for" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("finished")
 def test_a_table_in_json_is_written_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["evaluate", "one", "--json", "one/score.json"]) == 2
     line = "tsbench: one/score.json exists and nothing is overwritten\n"
     assert capsys.readouterr().err == line
+
+
+def test_a_run_that_cannot_begin_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["run", "task=rocket_navigation", "budget=smoke", "directory=mine"]
+    (tmp_path / "mine").mkdir()
+    assert cli.main([*words, "method.imitation=foo"]) == 2
+    assert "unknown imitation reward" in capsys.readouterr().err
+    assert list((tmp_path / "mine").iterdir()) == []
+    (tmp_path / "mine" / "movie.part").touch()
+    assert cli.main([*words, "method.imitation=foo"]) == 2
+    assert "mine holds other files" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["movie.part"]
+
+
+def test_a_run_in_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["run", "task=rocket_navigation", "budget=smoke", "threads=1", "directory=r"]
+    tiny = ["task.budgets.smoke.plan=256", "task.budgets.smoke.act=256"]
+    assert cli.main([*words, "-m", "--json", "sweep.json", *tiny]) == 2
+    assert "--json is for one run" in capsys.readouterr().err
+    Path("there.json").touch()
+    assert cli.main([*words, "--json", "there.json", *tiny]) == 2
+    assert "there.json exists and nothing is overwritten" in capsys.readouterr().err
+    assert not Path("r").exists()
+    assert cli.main([*words, "--json=r.json", *tiny]) == 0
+    assert json.loads(Path("r.json").read_text()) == record.shown(record.read_score(Path("r")))
 
 
 @pytest.mark.parametrize("content", [b"", b"rubbish", b"\x00" * 100, b"{}", b"[1]", b"{"])

@@ -81,7 +81,7 @@ def load(
     """
     from tsbench.sim.single import environment
 
-    mdp = _variant(name, variant, reference, perturbed, push, constants)
+    mdp = _variant(name, variant, reference, seed, perturbed, push, constants)
     return environment(mdp, seed, perturbed=perturbed, push=push)
 
 
@@ -104,7 +104,9 @@ def load_batched(
     from tsbench.sim.batched import BatchedEnvironment, Physics
     from tsbench.sim.kinematic import Planning
 
-    mdp = _variant(name, variant, reference, perturbed, push, constants)
+    mdp = _variant(name, variant, reference, seed, perturbed, push, constants)
+    if count < 1:
+        raise TsbenchError(f"count must be at least 1, not {count}")
     dynamics: Any = mdp
     if not isinstance(mdp, Planning):
         dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed, push=push)
@@ -112,7 +114,7 @@ def load_batched(
 
 
 def evaluate(
-    policy: Policy | Path | str | Callable[[np.ndarray], Any],
+    policy: Policy | Path | str | Callable[[np.ndarray], Any] | Any,
     task: str,
     *,
     protocol: str = "v1",
@@ -121,9 +123,10 @@ def evaluate(
     """Scores a policy by the evaluation protocol (`tsbench/evaluation/protocol.py`).
 
     Args:
-        policy: a `tsbench.policy.Policy`, the directory of one, an ONNX file, or any function of
-            one observation (o,) that returns one action (a,) in [-1, 1]. For stable-baselines3
-            there is `tsbench.adapters.from_sb3`.
+        policy: a `tsbench.policy.Policy`, the directory of one, an ONNX file, a
+            stable-baselines3 model, or any function of one observation (o,) that returns one
+            action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
+            `tsbench.adapters.from_sb3`.
         task: its name.
         protocol: "v1", or "smoke" for a first look that cannot be ranked.
         threads: for the physics, None for all cores; the score does not depend on it.
@@ -144,7 +147,13 @@ def evaluate(
     if isinstance(policy, (str, Path)):
         policy = adapters.load(Path(policy), made)
     if not isinstance(policy, (Policy, adapters.ForeignPolicy)):
-        policy = adapters.from_function(policy, made)
+        if callable(policy):
+            policy = adapters.from_function(policy, made)
+        elif hasattr(policy, "predict"):
+            policy = adapters.from_sb3_model(policy, made)
+        else:
+            kind = type(policy).__name__
+            raise TsbenchError(f"a policy must be a model, a file or a function, not {kind}")
     return score(policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads)
 
 
@@ -152,15 +161,24 @@ def _variant(
     name: str,
     variant: str | None,
     reference: ReferenceMotion | None,
+    seed: int | None,
     perturbed: bool,
     push: Push | None,
     constants: dict[str, Any],
 ) -> Any:
     from tsbench import tasks
+    from tsbench.motion import ReferenceMotion
     from tsbench.sim.kinematic import Planning
+    from tsbench.sim.push import Push
     from tsbench.sim.tracking import Imitation
 
     task = tasks.make(name, **constants)
+    for word, value, kind in (("reference", reference, ReferenceMotion), ("push", push, Push)):
+        if not isinstance(value, (kind, type(None))):
+            given = type(value).__name__
+            raise TsbenchError(f"{word} must be a {kind.__name__} or None, not {given}")
+    if seed is not None and seed < 0:
+        raise TsbenchError(f"seed must not be negative, not {seed}")
     if variant is None:
         return task
     if variant == "planning":

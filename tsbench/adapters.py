@@ -19,6 +19,7 @@ from tsbench.errors import TsbenchError, os_errors, unknown
 from tsbench.mdp import MDP
 from tsbench.policy import Policy
 
+ONNX_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # those with continuous actions
 
 
@@ -84,15 +85,19 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     except Exception as error:  # onnxruntime's own exceptions share no base class
         raise TsbenchError(f"damaged ONNX file {path}: {_line(error)}") from None
     inputs = session.get_inputs()
-    if len(inputs) != 1 or inputs[0].shape[-1:] != [mdp.observation_size]:
-        shapes = ", ".join(str(one.shape) for one in inputs)
+    size, (first, *others) = mdp.observation_size, inputs
+    # The number of rows is 1, or not fixed: a name or nothing.
+    fits = len(first.shape) == 2 and first.shape[1] == size
+    fits = fits and (first.shape[0] == 1 or not isinstance(first.shape[0], int))
+    if others or not fits or first.type not in ONNX_TYPES:
+        given = ", ".join(f"{one.type} {one.shape}" for one in inputs)
         raise TsbenchError(
-            f"{path} takes {shapes}, not one input (n, {mdp.observation_size}) for {mdp.name}"
+            f"{path} takes {given}, not one input of floats (n, {size}) for {mdp.name}"
         )
-    kind = np.float64 if inputs[0].type == "tensor(double)" else np.float32
 
     def answer(observation: np.ndarray) -> Any:
-        return session.run(None, {inputs[0].name: observation[None].astype(kind)})[0][0]
+        given = observation[None].astype(ONNX_TYPES[first.type])
+        return session.run(None, {first.name: given})[0][0]
 
     return ForeignPolicy(
         answer, mdp.observation_size, mdp.action_size, hashlib.sha256(content).hexdigest()
@@ -117,19 +122,28 @@ def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
         model = getattr(baselines, algorithm).load(path, device="cpu")
     except Exception as error:  # pickle, zipfile and torch raise anything
         raise TsbenchError(f"damaged stable-baselines3 file {path}: {_line(error)}") from None
+    return from_sb3_model(model, mdp, str(path), hashlib.sha256(content).hexdigest())
+
+
+def from_sb3_model(
+    model: Any, mdp: MDP[Any], name: str = "the model", sha256: str | None = None
+) -> ForeignPolicy:
+    """A stable-baselines3 model that is there already, acting deterministically.
+
+    Raises:
+        TsbenchError: it is of other sizes.
+    """
     sizes = (model.observation_space.shape, model.action_space.shape)
     if sizes != ((mdp.observation_size,), (mdp.action_size,)):
         raise TsbenchError(
-            f"{path} maps observations {sizes[0]} to actions {sizes[1]}, not "
+            f"{name} maps observations {sizes[0]} to actions {sizes[1]}, not "
             f"({mdp.observation_size},) to ({mdp.action_size},) as {mdp.name} does"
         )
 
     def answer(observation: np.ndarray) -> Any:
         return model.predict(observation.astype(np.float32), deterministic=True)[0]
 
-    return ForeignPolicy(
-        answer, mdp.observation_size, mdp.action_size, hashlib.sha256(content).hexdigest()
-    )
+    return ForeignPolicy(answer, mdp.observation_size, mdp.action_size, sha256)
 
 
 def load(path: Path, mdp: MDP[Any], sb3: str | None = None) -> Policy | ForeignPolicy:

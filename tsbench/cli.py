@@ -42,6 +42,7 @@ words, in Hydra's grammar:
 
 options:
   --cfg job        show the configuration and stop
+  --json FILE      write the score to a new JSON file too, as `tsbench evaluate` does
   -m, --multirun   a sweep: every combination of the values given, e.g. seed=0,1,2 task=a,b
   --hydra-help     Hydra's own flags; -sc install=bash prints the shell completion
 
@@ -51,6 +52,7 @@ examples:
 """
 
 
+JSON_HELP = "write what is shown to a new JSON file too"
 PICTURES = ("--video", "--strip")  # what OpenGL draws
 
 
@@ -66,15 +68,15 @@ class Verb:
     """A command: what it does in a few words, and the function that takes its arguments."""
 
     summary: str
-    call: Callable[[Sequence[str]], None]
+    call: Callable[[Sequence[str]], int | None]  # the exit status, None for 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command and returns the exit status: 0, 2 for a user's mistake, 130 for Ctrl-C,
-    143 for SIGTERM."""
+    """Runs a command and returns the exit status: 0, 1 where a score is not what it was, 2 for a
+    user's mistake, 130 for Ctrl-C, 143 for SIGTERM."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        _dispatch(words)
+        status = _dispatch(words)
         sys.stdout.flush()
     except TsbenchError as error:
         return _fail(str(error), 2)
@@ -88,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:  # a file that nobody took care of, or the output itself
         _drop_output()
         return _fail(f"{error.filename or 'output'}: {error.strerror or error}", 2)
-    return 0
+    return status
 
 
 def _fail(line: str, status: int) -> int:
@@ -101,7 +103,7 @@ def _drop_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _dispatch(words: list[str]) -> None:
+def _dispatch(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
         sys.stdout.write(_help())
     elif words[0] == "--version":
@@ -112,9 +114,10 @@ def _dispatch(words: list[str]) -> None:
         if words[0] == "view" and any(w.startswith(PICTURES) for w in words):
             find_working_backend()
         _check_graphics()
-        VERBS[words[0]].call(words[1:])
+        return VERBS[words[0]].call(words[1:]) or 0
     else:
         raise unknown("command", words[0], VERBS)
+    return 0
 
 
 def _check_graphics() -> None:
@@ -149,7 +152,10 @@ def _run(words: Sequence[str]) -> None:
         return
     from tsbench import launch
 
-    launch.launch(words)
+    parser = Parser("tsbench run", add_help=False, allow_abbrev=False)
+    parser.add_argument("--json", type=_new_file)
+    options, others = parser.parse_known_args(words)
+    launch.launch(others, options.json)
 
 
 def _complete(words: Sequence[str]) -> None:
@@ -168,9 +174,10 @@ def _list(words: Sequence[str]) -> None:
     parser = _parser("list")
     options = parser.parse_args(words)
     from tsbench import config, methods, tasks
+    from tsbench.record import write_json
 
     made = {name: tasks.make(name) for name in tasks.names()}
-    budgets = {name: config.compose([f"task={name}"]).task.budgets for name in config.names("task")}
+    budgets = {name: config.budgets(name) for name in made}
     rows = {
         name: {
             "version": task.version,
@@ -181,7 +188,6 @@ def _list(words: Sequence[str]) -> None:
         for name, task in made.items()
     }
     summaries = {name: methods.summary(name) for name in methods.names()}
-    _write_json(options.json, {"tasks": rows, "methods": summaries})
     offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for header in ("task", "version", "seconds", *offered):
@@ -197,6 +203,7 @@ def _list(words: Sequence[str]) -> None:
     for name, summary in summaries.items():
         table.add_row(name, summary)
     console.print(table)
+    write_json(options.json, {"tasks": rows, "methods": summaries})
 
 
 def _short(steps: int) -> str:
@@ -211,19 +218,20 @@ def _parser(verb: str, *, json: bool = True) -> Parser:
     summary = VERBS[verb].summary
     parser = Parser(f"tsbench {verb}", description=summary, allow_abbrev=False)
     if json:
-        what = "write what is shown to a new JSON file too"
-        parser.add_argument("--json", type=Path, metavar="FILE", help=what)
+        parser.add_argument("--json", type=_new_file, metavar="FILE", help=JSON_HELP)
     return parser
 
 
-def _write_json(path: Path | None, content: Any) -> None:
-    if path is not None:
-        from tsbench.record import write_json
+def _new_file(word: str) -> Path:
+    """A path that can be written: what took hours must not be lost at its end."""
+    from tsbench.record import check_new
 
-        write_json(path, content)
+    path = Path(word)
+    check_new(path)
+    return path
 
 
-def _evaluate(words: Sequence[str]) -> None:
+def _evaluate(words: Sequence[str]) -> int:
     parser = _parser("evaluate")
     parser.add_argument(
         "policy",
@@ -252,20 +260,24 @@ def _evaluate(words: Sequence[str]) -> None:
     if name not in PROTOCOLS:
         raise unknown("protocol", name, PROTOCOLS)
     protocol = PROTOCOLS[name]
+    log = record.read_actions(path) if kept else None
     score = evaluate(policy, task, protocol=protocol, threads=options.threads)
     content = score.as_dict()
-    _write_json(options.json, content)
     console = Console()
     console.print(tables.score_table(f"{task.name}: {options.policy}", content))
+    shown, agrees = content, None
     if kept is not None:
-        log = record.read_actions(path)
         starts = episode_starts(task, perturbed_starts(task, protocol))
         comparison = compare(kept["score"], content, protocol, task, starts, log)
+        agrees = comparison.agrees
+        shown = record.shown(kept | {"score": content}) | {"comparison": vars(comparison)}
         line = f" {path / record.SCORE}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if options.keep is not None:
         record.keep(path, options.keep, content, score.log)
         console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
+    record.write_json(options.json, shown)
+    return 1 if agrees is False else 0
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
@@ -370,6 +382,8 @@ def _report(words: Sequence[str]) -> None:
     from tsbench.viewer import page, report
 
     path = options.html or options.run / record.REPORT
+    if path.exists():
+        raise TsbenchError(f"{path} exists and nothing is overwritten: give another by --html FILE")
     page.write(path, report.render(options.run))
     sys.stdout.write(f"{path}\n")
 
@@ -381,13 +395,14 @@ def _bench(words: Sequence[str]) -> None:
     options = parser.parse_args(words)
     from tsbench import bench
     from tsbench.bench import table
+    from tsbench.record import write_json
 
     progress = Console(stderr=True)
     findings = bench.measure(
         options.only, quick=options.quick, tell=lambda name: progress.print(f"measuring {name}")
     )
-    _write_json(options.json, findings.as_dict())
     table.show(Console(), findings)
+    write_json(options.json, findings.as_dict())
 
 
 VERBS = {

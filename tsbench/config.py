@@ -17,7 +17,12 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import CompactHydraException, MissingConfigException, OverrideParseException
+from hydra.errors import (
+    CompactHydraException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -163,13 +168,29 @@ def names(group: str) -> tuple[str, ...]:
     return tuple(sorted(f.name.removesuffix(".yaml") for f in found if f.name.endswith(".yaml")))
 
 
+def budgets(task: str) -> dict[str, Budget]:
+    """The budgets that a task's configuration offers; none without a configuration.
+
+    Raises:
+        TsbenchError: the configuration is wrong.
+    """
+    if task not in names("task"):
+        return {}
+    text = (files(CONFIGURATIONS) / "task" / f"{task}.yaml").read_text(encoding="utf-8")
+    with one_line_errors():
+        plain = OmegaConf.to_container(OmegaConf.create(text), resolve=True)
+    config: TaskConfig = typed(TaskConfig, plain, "task")
+    return config.budgets
+
+
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """Turns what Hydra and OmegaConf raise about the user's words into a TsbenchError."""
     try:
         yield
     except OverrideParseException as error:
-        raise TsbenchError(f"cannot read '{error.override}': expected key=value") from None
+        words = "expected key=value, the value quoted where it has special characters"
+        raise TsbenchError(f"cannot read '{error.override}': {words}") from None
     except MissingConfigException as error:
         if error.options is None or error.missing_cfg_file is None:
             raise TsbenchError(_flat(error)) from None
@@ -183,7 +204,7 @@ def one_line_errors() -> Iterator[None]:
             siblings = [str(name) for name in cause.parent_node if name != "hydra"]
             raise unknown_key(path, str(cause.key), siblings) from None
         raise TsbenchError(_flat(error)) from None
-    except OmegaConfBaseException as error:
+    except (HydraException, OmegaConfBaseException) as error:
         raise TsbenchError(_flat(error)) from None
 
 

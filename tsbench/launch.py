@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from tsbench import config, run
 from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError
-from tsbench.record import LOG
+from tsbench.record import LOG, read_score, shown, write_json
 
 RUNS = Path("runs")
 LONGEST_NAME = 200  # characters; file systems allow 255 bytes
@@ -32,8 +32,12 @@ OWN_SEARCH_PATH = ("config_path", "config_name", "config_dir", "experimental_rer
 NO_JOB = ("shell_completion", "hydra_help", "info")
 
 
-def launch(words: Sequence[str]) -> None:
+def launch(words: Sequence[str], json: Path | None = None) -> None:
     """Does what `tsbench run WORDS` asks for; every job is checked before the first one starts.
+
+    Args:
+        words: of the command line.
+        json: a file that the score of one run is written to as well.
 
     Raises:
         TsbenchError: the words are wrong, or runs failed. The other runs of a sweep go on.
@@ -44,8 +48,12 @@ def launch(words: Sequence[str]) -> None:
     if any(word.startswith(RESUME) for word in words):
         if len(words) > 1:
             raise TsbenchError("resume=RUN goes on with the run's own configuration: give it alone")
-        run.resume(Path(words[0].removeprefix(RESUME)))
+        resumed = Path(words[0].removeprefix(RESUME))
+        run.resume(resumed)
+        write_json(json, shown(read_score(resumed)))
         return
+    if json is not None and flags.multirun:
+        raise TsbenchError("--json is for one run; each of a sweep's has its score.json")
     if not any(getattr(flags, name) for name in (*OWN_SEARCH_PATH, *NO_JOB)):
         jobs = config.sweep(flags.overrides) if flags.multirun else [list(flags.overrides)]
         for job in islice(jobs, CHECKED_JOBS):
@@ -66,7 +74,9 @@ def launch(words: Sequence[str]) -> None:
         try:
             if flags.multirun:
                 return run.complete(chosen, given)
-            return run.execute(chosen, given).normalized_reward
+            reward = run.execute(chosen, given).normalized_reward
+            write_json(json, shown(read_score(Path(chosen.directory or ""))))
+            return reward
         except Exception as error:
             known = isinstance(error, TsbenchError)
             # A launcher's worker has to let the failure travel back.

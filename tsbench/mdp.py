@@ -17,7 +17,7 @@ from typing import Any, Generic, Self, TypeVar, cast
 import mujoco
 import numpy as np
 
-from tsbench.errors import unknown
+from tsbench.errors import TsbenchError, unknown
 from tsbench.motion import Audit, Plan, ReferenceMotion
 
 Array = Any  # an array of any library that follows the array API standard
@@ -299,6 +299,26 @@ class Task(MDP[S]):
     @abstractmethod
     def reference(self, plan: Plan) -> ReferenceMotion:
         """The plan as full poses at the control rate."""
+
+    def check_fit(self, motion: Plan | ReferenceMotion) -> None:
+        """
+        Raises:
+            TsbenchError: the motion is for another task or version of it, or has other sizes.
+        """
+        if (motion.task, motion.task_version) != (self.name, self.version):
+            raise TsbenchError(
+                f"the {motion.kind} is for {motion.task} version {motion.task_version}, "
+                f"not for {self.name} version {self.version}"
+            )
+        if isinstance(motion, Plan):
+            sizes = {"states": len(self.abstraction().coordinates)}
+        else:
+            model = self.spec().compile()
+            sizes = {"qpos": model.nq, "qvel": model.nv}
+        for name, size in sizes.items():
+            found = getattr(motion, name).shape[1]
+            if found != size:
+                raise TsbenchError(f"the {motion.kind} has {found} {name} a step, not {size}")
 
     @abstractmethod
     def audit(self, plan: Plan, reference: ReferenceMotion) -> Audit:

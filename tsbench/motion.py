@@ -90,6 +90,8 @@ def _content(path: Path, kind: str) -> dict[str, np.ndarray]:
         TsbenchError: the file is missing or damaged.
     """
     try:
+        if path.is_file() and not zipfile.is_zipfile(path):
+            raise TsbenchError(f"damaged {kind} file {path}: it is no npz file")
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except FileNotFoundError:

@@ -183,8 +183,9 @@ class Policy:
 
 
 def _read_info(path: Path) -> PolicyInfo:
+    content = _read(path)
     try:
-        info: PolicyInfo = typed(PolicyInfo, json.loads(_read(path)), "")
+        info: PolicyInfo = typed(PolicyInfo, json.loads(content), "")
     except (ValueError, RecursionError, TsbenchError) as error:
         raise TsbenchError(f"damaged policy file {path}: {error}") from None
     if info.format != FORMAT:

@@ -6,9 +6,11 @@ import json
 import math
 import re
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from tsbench import tasks
@@ -75,6 +77,14 @@ def read_score(directory: Path) -> dict[str, Any]:
         if robustness := score.get("robustness"):
             needed += [robustness[name] for name in ("survival_100N", "impulse_50")]
             needed.append(robustness["impulse_50_is_lower_bound"])
+            shape = tuple(
+                len(robustness["surface"][name]) for name in ("forces_N", "headings_rad", "phases")
+            )
+            if np.shape(robustness["surface"]["survived"]) != shape:
+                raise ValueError("the surface of pushes does not fit its axes")
+        for stage in record["stages"]:
+            needed += [stage[name] for name in ("steps", "physics_substeps", "seconds")]
+            _ = str(stage["name"])
         for value in needed:
             if not (isinstance(value, (int, float)) and math.isfinite(value)):
                 raise ValueError(f"{value!r} where a number should be")
@@ -143,14 +153,34 @@ def keep(run: Path, entry: Path, score: dict[str, Any], log: ActionLog) -> None:
     write_json(entry / SCORE, content)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Writes a JSON file; nothing is overwritten.
+def shown(record: dict[str, Any]) -> dict[str, Any]:
+    """What `--json` has of a run: its score's figures, and what its stages took."""
+    return {**record["score"], "stages": record["stages"]}
+
+
+def check_new(path: Path) -> None:
+    """
+    Raises:
+        TsbenchError: `write_json` could not write there, whatever the content.
+    """
+    if path.exists():
+        raise TsbenchError(f"{path} exists and nothing is overwritten")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise TsbenchError(f"{path}: {error.strerror}") from None
+
+
+def write_json(path: Path | None, content: Any) -> None:
+    """Writes a JSON file, if one is asked for; nothing is overwritten.
 
     Raises:
         TsbenchError: the file exists or cannot be written.
     """
-    if path.exists():
-        raise TsbenchError(f"{path} exists and nothing is overwritten")
+    if path is None:
+        return
+    check_new(path)
     with os_errors(path):
         write_whole(path, (_legible(json.dumps(content, indent=2)) + "\n").encode())
 

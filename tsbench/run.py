@@ -87,7 +87,7 @@ def prepare(config: RunConfig) -> Problem:
         threads=config.threads,
     )
     methods.options(methods.find(config.method["name"]).Options, problem)
-    for kind in sorted(set(KINDS) | set(config.task.training)):
+    for kind in dict.fromkeys([*KINDS, *config.task.training]):
         settings(problem, kind)
     return problem
 
@@ -108,6 +108,7 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
     problem = prepare(config)
     directory = Path(config.directory or "")
     with os_errors(directory):
+        found = set(directory.iterdir()) if directory.is_dir() else None
         _create(directory)
     with _locked(directory), _explained(directory):
         try:
@@ -116,7 +117,7 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
             return _work(config, problem, directory, line, console or Console())
         except (TsbenchError, OSError) as error:
             if not _trained(directory) and not isinstance(error, NotFiniteError):
-                shutil.rmtree(directory, ignore_errors=True)
+                _leave_as_found(directory, found)
             raise
 
 
@@ -130,16 +131,17 @@ def resume(directory: Path, console: Console | None = None) -> Score:
     """
     if not (directory / CONFIG).is_file():
         raise TsbenchError(f"there is no run in {directory}")
-    with _locked(directory), _explained(directory):
+    with _locked(directory):
         if (directory / SCORE).exists():
             raise TsbenchError(f"{directory} holds a finished run: there is nothing to resume")
         config = replace(read_config(directory), directory=str(directory))
         problem = prepare(config)
         _check_provenance(directory, config, problem)
-        for path in (directory / PAGE, directory / REPORT, *directory.rglob(f"*{PART}")):
-            path.unlink(missing_ok=True)
-        line = f"tsbench run resume={directory}"
-        return _work(config, problem, directory, line, console or Console())
+        with _explained(directory):
+            for path in (directory / PAGE, directory / REPORT, *directory.rglob(f"*{PART}")):
+                path.unlink(missing_ok=True)
+            line = f"tsbench run resume={directory}"
+            return _work(config, problem, directory, line, console or Console())
 
 
 def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
@@ -271,8 +273,8 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
 def _create(directory: Path) -> None:
     """Makes the directory. One that is empty, or that a run left before it began, will do."""
     directory.mkdir(parents=True, exist_ok=True)
-    left = {path.name for path in directory.iterdir() if path.suffix != PART}
-    if left <= {VERSIONS}:
+    left = {path.name.removesuffix(PART) for path in directory.iterdir()}
+    if left <= {VERSIONS, CONFIG} and not (directory / CONFIG).exists():
         return
     if (directory / SCORE).exists():
         state, way = "a finished run", ""
@@ -283,6 +285,18 @@ def _create(directory: Path) -> None:
     raise TsbenchError(
         f"{directory} holds {state} and nothing is overwritten: {way}choose another directory=PATH"
     )
+
+
+def _leave_as_found(directory: Path, found: set[Path] | None) -> None:
+    """Removes what a run has written; `found` is what was there before, None for no directory."""
+    if found is None:
+        shutil.rmtree(directory, ignore_errors=True)
+        return
+    for path in set(directory.iterdir()) - found:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _write_provenance(

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from tsbench import TsbenchError, methods, tasks
+from tsbench.config import compose
 from tsbench.evaluation.evaluate import check_fit
 from tsbench.methods import twostage
 from tsbench.motion import Plan, ReferenceMotion
@@ -203,6 +204,9 @@ def test_no_such_method() -> None:
 def test_every_method_says_what_it_is(name: str) -> None:
     module = methods.find(name)
     assert module.Options() == module.Options()
+    # What a method offers is in its configuration, where `key=value` and `--cfg job` find it.
+    offered = {**vars(module.Options()), "name": name}
+    assert compose([f"task={tasks.names()[0]}", f"method={name}"]).method == offered
     summary = methods.summary(name)
     assert 20 < len(summary) < 100
     assert "\n" not in summary

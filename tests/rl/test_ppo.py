@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from tsbench import TsbenchError, tasks
+from tsbench.errors import NotFiniteError
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS, Policy
 from tsbench.problem import Budget, Problem
@@ -106,6 +107,14 @@ def test_rate_and_spread_fall_over_a_stage() -> None:
     rates = [metrics["learning_rate"] for metrics in reports]
     np.testing.assert_allclose(rates, 1e-3 * 10.0 ** (-0.5 * np.arange(1, 5)))
     assert 0.0 < taught._ppo.actor.distribution.std_param.max().item() <= 0.05 + 1e-6
+
+
+def test_weights_that_blow_up_are_noticed_at_once() -> None:
+    """Before the next action is drawn from them, and with what there is to look at."""
+    taught = learner(replace(TINY, desired_kl=None, learning_rate=1e20))
+    with pytest.raises(NotFiniteError, match="in the iteration after 0 steps") as caught:
+        taught.learn(512)
+    assert caught.value.arrays
 
 
 def test_physics_steps_are_counted() -> None:
@@ -257,6 +266,7 @@ def test_settings() -> None:
         ({"desired_kl": 0.0}, r"desired_kl"),
         ({"entropy": float("inf")}, r"entropy"),
         ({"value_weight": -1.0}, r"value_weight"),
+        ({"disturb": {"push": 9.0}}, r"plan\.disturb: planning has no physics to disturb"),
     ],
 )
 def test_settings_that_make_no_sense(changes: dict[str, Any], message: str) -> None:

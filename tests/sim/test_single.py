@@ -117,6 +117,35 @@ def test_an_episode_along_the_reference_is_shorter(
     assert len(set(lengths)) > 2
 
 
+def test_actions_of_other_shapes_are_refused() -> None:
+    """numpy would stretch one number over all joints, and leave out what a rocket has none of."""
+    trot = tsbench.load("laikago_trot")
+    trot.reset()
+    with pytest.raises(tsbench.TsbenchError, match=r"action has shape \(1,\), not \(12,\)"):
+        trot.step(np.zeros(1))
+    rockets = tsbench.load_batched("rocket_navigation", count=2)
+    rockets.reset()
+    for shape in ((2, 5), (1, 2), (2,)):
+        with pytest.raises(tsbench.TsbenchError, match=r"not \(2, 2\)"):
+            rockets.step(np.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"variant": "imitation", "reference": "plan.npz"}, "must be a ReferenceMotion or None"),
+        ({"push": "100N@0.5s:+y"}, "push must be a Push or None, not str"),
+        ({"seed": -1}, "seed must not be negative, not -1"),
+        ({"distance": "far"}, "distance of laikago_trot must be a number, not 'far'"),
+        ({"count": 0}, "count must be at least 1, not 0"),
+    ],
+)
+def test_wrong_arguments(arguments: dict[str, Any], message: str) -> None:
+    load: Any = tsbench.load_batched if "count" in arguments else tsbench.load
+    with pytest.raises(tsbench.TsbenchError, match=message):
+        load("laikago_trot", **arguments)
+
+
 def test_actions_of_any_number_type() -> None:
     results = []
     for action in ([1, 0], np.array([1, 0]), np.array([1.0, 0.0], np.float32)):

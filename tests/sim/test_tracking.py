@@ -114,6 +114,15 @@ def test_foreign_references_are_refused(
         Imitation(tasks.make("laikago_trot"), reference)
 
 
+def test_references_of_other_sizes_are_refused(
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    reference = naive_reference("laikago_trot")
+    narrow = replace(reference, qvel=reference.qvel[:, :-1])
+    with pytest.raises(TsbenchError, match="reference motion has 17 qvel a step, not 18"):
+        Imitation(tasks.make("laikago_trot"), narrow)
+
+
 def test_form(naive_reference: Callable[[str], ReferenceMotion]) -> None:
     name = "rocket_navigation"
     task, reference = tasks.make(name), naive_reference(name)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from tsbench import cli
+from tsbench import cli, curves
 from tsbench.errors import TsbenchError
+from tsbench.motion import Plan
 from tsbench.viewer import report
 
 MakeRun = Callable[..., Path]
@@ -75,4 +77,17 @@ def test_the_command_writes_it_beside_the_run(
     assert capsys.readouterr().out == f"{run / 'report.html'}\n"
     assert (run / "report.html").read_text("utf-8").startswith("<!DOCTYPE html>")
     assert cli.main(["report", str(run)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "nothing is overwritten: give another by --html FILE" in capsys.readouterr().err
+
+
+def test_what_does_not_belong_to_the_run_is_refused(
+    make_run: MakeRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run("rocket_navigation", 0.7)
+    plan = Plan.load(run / "plan.npz")
+    replace(plan, task="laikago_trot").save(run / "plan.npz")
+    assert cli.main(["report", str(run)]) == 2
+    assert "the plan is for laikago_trot version 1, not for" in capsys.readouterr().err
+    (run / "metrics.jsonl").write_text('{"stage": "plan", "st')
+    with pytest.raises(TsbenchError, match="damaged metrics"):
+        curves.figure(run / "metrics.jsonl")

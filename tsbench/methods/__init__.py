@@ -12,7 +12,7 @@ import pkgutil
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from tsbench.errors import unknown
+from tsbench.errors import TsbenchError, unknown
 from tsbench.policy import Policy
 from tsbench.problem import Problem, Workspace
 from tsbench.typed import typed
@@ -50,11 +50,15 @@ def find(name: str) -> Method:
     """The method of that name.
 
     Raises:
-        TsbenchError: there is none.
+        TsbenchError: there is none, or it lacks a part.
     """
     if name not in names():
         raise unknown("method", name, names())
-    return cast(Method, importlib.import_module(f"{__name__}.{name}"))
+    module = importlib.import_module(f"{__name__}.{name}")
+    for part in ("Options", "train"):
+        if not hasattr(module, part):
+            raise TsbenchError(f"the method {name} has no {part} (see tsbench.methods.Method)")
+    return cast(Method, module)
 
 
 def options(kind: type[Any], problem: Problem) -> Any:

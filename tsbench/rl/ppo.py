@@ -202,8 +202,7 @@ class Learner:
                     )
                 ppo.compute_returns(observation)
             collected = time.perf_counter()
-            losses = ppo.update()
-            self._expect_finite(losses)
+            losses = self._update()
             self.steps += env.num_envs * self.settings.rollout
             self._settle(min(self.steps / steps, 1.0))
             if report is not None:
@@ -221,6 +220,16 @@ class Learner:
                     metrics["episode_length"] = float(np.mean(self._lengths))
                 report(self.steps, metrics)
 
+    def _update(self) -> dict[str, float]:
+        try:
+            losses = self._ppo.update()
+        except RuntimeError:  # torch cannot draw actions, perhaps from what has blown up
+            self._expect_sound()
+            raise
+        self._expect_finite(losses)
+        self._expect_sound()
+        return losses
+
     def _expect_finite(self, losses: Mapping[str, float]) -> None:
         for name, loss in losses.items():
             if not math.isfinite(loss):
@@ -230,6 +239,19 @@ class Learner:
                 arrays |= _arrays(storage.observations.to_dict())
                 message = f"the {name} loss is not finite in the iteration after {self.steps} steps"
                 raise NotFiniteError(message, arrays)
+
+    def _expect_sound(self) -> None:
+        """The losses are those before the last update; what it left is looked at too."""
+        networks = {"actor": self._ppo.actor, "critic": self._ppo.critic}
+        finite = all(w.isfinite().all() for n in networks.values() for w in n.parameters())
+        if not (finite and self._ppo.actor.distribution.std_param.min() > 0.0):
+            arrays = {
+                f"{network}.{name}": tensor.numpy()
+                for network, model in networks.items()
+                for name, tensor in model.state_dict().items()
+            }
+            message = "a weight is not finite, or the spread not positive, in the iteration after "
+            raise NotFiniteError(f"{message}{self.steps} steps", arrays)
 
     def _settle(self, share: float) -> None:
         """Holds the policy's spread below its bound, and lowers the learning rate, after a share

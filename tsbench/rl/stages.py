@@ -42,6 +42,8 @@ def settings(problem: Problem, kind: str) -> StageSettings:
         changes |= typed_items(StageSettings, given, f"task.training.{name}")
     if problem.budget.environments is not None:
         changes["environments"] = problem.budget.environments
+    if kind == "plan" and changes.get("disturb", Disturbances()) != Disturbances():
+        raise TsbenchError("task.training.plan.disturb: planning has no physics to disturb")
     try:
         return StageSettings(**changes)
     except ValueError as error:

@@ -251,9 +251,11 @@ class BatchedEnvironment(Generic[S]):
         """One time step of all episodes; `action` has shape (n, action_size).
 
         Raises:
+            TsbenchError: the action has another shape.
             NotFiniteError: a number in action, state or reward is not finite.
         """
         began = perf_counter()
+        expect_shape(action, (self.count, self.mdp.action_size))
         previous = self.state
         self.steps += 1
         expect_finite(self.steps, previous, action)
@@ -291,6 +293,15 @@ class BatchedEnvironment(Generic[S]):
         self.steps = snapshot["steps"]
         self.state = self.state.replace(**snapshot["state"])
         self.dynamics.restore(snapshot["dynamics"])
+
+
+def expect_shape(action: np.ndarray, shape: tuple[int, ...]) -> None:
+    """
+    Raises:
+        TsbenchError: the action has another shape; numpy would stretch or cut some of them.
+    """
+    if np.shape(action) != shape:
+        raise TsbenchError(f"the action has shape {np.shape(action)}, not {shape}")
 
 
 def expect_finite(

@@ -15,7 +15,7 @@ from dm_control.mujoco.wrapper import MjModel
 from dm_control.rl import control
 
 from tsbench.mdp import MDP, Array, Readings, State, Task
-from tsbench.sim.batched import expect_finite
+from tsbench.sim.batched import expect_finite, expect_shape
 from tsbench.sim.change import Change
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
@@ -51,6 +51,7 @@ class Adapter(control.Task):
     def before_step(self, action: np.ndarray, physics: dm_mujoco.Physics) -> None:
         self._previous = self.state
         self._action = np.asarray(action, float)[None]
+        expect_shape(self._action[0], (self.mdp.action_size,))
         self._steps += 1
         expect_finite(np.array([self._steps]), self._previous, self._action)
 

@@ -7,7 +7,6 @@ from typing import Any
 import mujoco
 from array_api_compat import array_namespace
 
-from tsbench.errors import TsbenchError
 from tsbench.mdp import Abstraction, Array, Readings, Rng, S, Start, Task
 from tsbench.motion import Audit, Plan, ReferenceMotion
 
@@ -19,14 +18,9 @@ class Imitation(Task[S]):
         """`form` picks one of the task's tracking rewards.
 
         Raises:
-            TsbenchError: the reference was made for another task or version of it, or `form` is
-                unknown.
+            TsbenchError: the reference does not fit the task, or `form` is unknown.
         """
-        if (reference.task, reference.task_version) != (task.name, task.version):
-            raise TsbenchError(
-                f"the reference motion is for {reference.task} version {reference.task_version}, "
-                f"not for {task.name} version {task.version}"
-            )
+        task.check_fit(reference)
         self.task = task
         self._reference = reference
         self.tracking = task.tracker(reference, form)

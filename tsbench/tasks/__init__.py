@@ -45,10 +45,13 @@ def make(name: str, **constants: Any) -> Task[Any]:
     """
     if name not in names():
         raise unknown("task", name, names())
-    allowed = tuple(inspect.signature(_factories[name]).parameters)
-    for constant in constants:
+    allowed = inspect.signature(_factories[name]).parameters
+    for constant, value in constants.items():
         if constant not in allowed:
             raise unknown(f"constant of {name}", constant, allowed)
+        number = isinstance(allowed[constant].default, (int, float))
+        if number and (isinstance(value, bool) or not isinstance(value, (int, float))):
+            raise TsbenchError(f"{constant} of {name} must be a number, not {value!r}")
     try:
         return _factories[name](**constants)
     except (TypeError, ValueError, OverflowError) as error:

@@ -161,7 +161,9 @@ def _tables(run: Subject, directory: Path) -> Iterator[str]:
     yield _table([("stage", "environment steps", "physics steps", "time"), *costs])
     path = directory / record.PLAN
     if path.exists() and run.reference is not None:
-        audit = run.task.audit(Plan.load(path), run.reference)
+        plan = Plan.load(path)
+        run.task.check_fit(plan)
+        audit = run.task.audit(plan, run.reference)
         items = [
             (item.what, f"{item.value:.3g} {item.unit}", f"{item.limit:.3g} {item.unit}",
              "ok" if item.passed else "too much")

@@ -96,12 +96,15 @@ def run_subject(directory: Path, score: Mapping[str, Any] | None = None) -> Subj
     policy, task = record.read_policy(directory)
     if score is None and (directory / record.SCORE).exists():
         score = record.read_score(directory)
-    reference = directory / record.REFERENCE
+    path = directory / record.REFERENCE
+    reference = ReferenceMotion.load(path) if path.exists() else None
+    if reference is not None:
+        task.check_fit(reference)
     return Subject(
         title=tables.run_title(score) if score else task.name,
         task=task,
         policy=policy,
-        reference=ReferenceMotion.load(reference) if reference.exists() else None,
+        reference=reference,
         score=score,
     )
 
@@ -110,13 +113,14 @@ def plan_subject(path: Path) -> Subject:
     """A plan or reference motion, with the constants of the run in whose directory it lies.
 
     Raises:
-        TsbenchError: the file is neither, or damaged.
+        TsbenchError: the file is neither, damaged, or for another version of its task.
     """
     motion = read_motion(path)
     constants = {}
     if (path.parent / record.CONFIG).exists():
         constants = record.read_config(path.parent).task.constants
     task = tasks.make(motion.task, **constants)
+    task.check_fit(motion)
     if isinstance(motion, Plan):
         motion = task.reference(motion)
     return Subject(f"{task.name}, {path.name}", task, None, motion)
