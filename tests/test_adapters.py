@@ -129,7 +129,7 @@ def test_onnx(rows: Any, tmp_path: Path) -> None:
 
 
 def test_onnx_files_that_do_not_fit(tmp_path: Path) -> None:
-    with pytest.raises(TsbenchError, match=r"not one input of floats \(n, 10\) for rocket_navigation"):
+    with pytest.raises(TsbenchError, match=r"not one input of floats \(n, 10\) for rocket_nav"):
         adapters.load(write_onnx(tmp_path / "p.onnx", inputs=11), TASK)
     with pytest.raises(TsbenchError, match=r"takes tensor\(float\) \[4, 10\], not one input"):
         adapters.load(write_onnx(tmp_path / "r.onnx", rows=4), TASK)
