@@ -274,7 +274,7 @@ def test_a_run_in_json(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = ["run", "task=rocket_navigation", "budget=smoke", "threads=1", "directory=r"]
-    tiny = ["task.budgets.smoke.plan=256", "task.budgets.smoke.act=256"]
+    tiny = ["task.budgets.smoke.act=512", "task.constants.distance=6.0"]
     assert cli.main([*words, "-m", "--json", "sweep.json", *tiny]) == 2
     assert "--json is for one run" in capsys.readouterr().err
     Path("there.json").touch()
@@ -388,7 +388,13 @@ def test_changed_constants_are_recorded(tmp_path: Path) -> None:
     assert policy.info.method == "monolithic"
 
 
-SHORT = [*WORDS[:3], "task.budgets.smoke.act=512", "task.training.imitate.epochs=1"]
+# So near that an episode takes a second and a half.
+SHORT = [
+    *WORDS[:3],
+    "task.budgets.smoke.act=512",
+    "task.training.imitate.epochs=1",
+    "task.constants.distance=6.0",
+]
 
 
 def test_a_sweep_goes_on_after_failures_and_lists_them(
