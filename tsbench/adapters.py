@@ -85,19 +85,26 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     except Exception as error:  # onnxruntime's own exceptions share no base class
         raise TsbenchError(f"damaged ONNX file {path}: {_line(error)}") from None
     inputs = session.get_inputs()
-    size, (first, *others) = mdp.observation_size, inputs
+    size = mdp.observation_size
     # The number of rows is 1, or not fixed: a name or nothing.
-    fits = len(first.shape) == 2 and first.shape[1] == size
-    fits = fits and (first.shape[0] == 1 or not isinstance(first.shape[0], int))
-    if others or not fits or first.type not in ONNX_TYPES:
+    fitting = [
+        one
+        for one in inputs
+        if one.type in ONNX_TYPES
+        and len(one.shape) == 2
+        and one.shape[1] == size
+        and (one.shape[0] == 1 or not isinstance(one.shape[0], int))
+    ]
+    if len(inputs) != 1 or not fitting:
         given = ", ".join(f"{one.type} {one.shape}" for one in inputs)
         raise TsbenchError(
             f"{path} takes {given}, not one input of floats (n, {size}) for {mdp.name}"
         )
 
+    kind, name = ONNX_TYPES[fitting[0].type], fitting[0].name
+
     def answer(observation: np.ndarray) -> Any:
-        given = observation[None].astype(ONNX_TYPES[first.type])
-        return session.run(None, {first.name: given})[0][0]
+        return session.run(None, {name: observation[None].astype(kind)})[0][0]
 
     return ForeignPolicy(
         answer, mdp.observation_size, mdp.action_size, hashlib.sha256(content).hexdigest()
