@@ -66,9 +66,13 @@ def test_what_is_written_is_what_was_measured(
 
 def test_the_rival_is_given_our_settings(
     naive_reference: Callable[[str], ReferenceMotion],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Stable-Baselines3 with our network, encoding and falling learning rate."""
+    """Stable-Baselines3 with our network, encoding and falling learning rate; it logs nothing."""
     pytest.importorskip("stable_baselines3")
+    logs = tmp_path / "logs"
+    monkeypatch.setenv("SB3_LOGDIR", str(logs))
     name = "rocket_navigation"
     imitation = Imitation(tasks.make(name), naive_reference(name))
     chosen = PPOSettings(
@@ -84,6 +88,7 @@ def test_the_rival_is_given_our_settings(
         rival.model.learn(16, reset_num_timesteps=False)
         rates.append(rival.model.policy.optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-4, 1e-5, 1e-5])
+    assert not logs.exists()
     far = np.full((1, imitation.observation_size), 1e6)
     assert np.all(np.isfinite(rival(far)))
 

@@ -131,6 +131,21 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", TASK, "budget=fats"], "(did you mean 'fast'?)"),
         (["run", TASK, "method.finetune=x"], "method.finetune must be a number, not 'x'"),
         (["run", TASK, "method.finetune=1.0"], "method.finetune must lie in [0, 1), not 1.0"),
+        (["run", TASK, "task.name=laikago_walk"], "task.name comes with task=NAME"),
+        (["run", TASK, "method.name=monolithic"], "method.name comes with method=NAME"),
+        (
+            ["run", TASK, "-m", "seed=0,1", "directory=d"],
+            "directory=d would be the place of several",
+        ),
+        (
+            ["run", TASK, "task.training.imitate.disturb.push=-1"],
+            "task.training.imitate.disturb.push must not be negative",
+        ),
+        (
+            ["run", TASK, "task.training.imitate.disturb={interval: 1e-9, duration: 1e-9}"],
+            "task.training.imitate.disturb.interval must be at least a control step of 0.02 s",
+        ),
+        (["evaluate", ".", "--trust-sb3", "PPO"], "--trust-sb3 is for a stable-baselines3 .zip"),
         (["run", TASK, "task.constants.distanse=1"], "(did you mean 'distance'?)"),
         (["run", TASK, "task.training.plan.cilp=1"], "(did you mean 'clip'?)"),
         (["run", TASK, "task.training.pln.clip=1"], "task.training.pln"),

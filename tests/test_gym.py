@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -53,7 +54,8 @@ def test_arguments_are_those_of_load() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_stable_baselines3_learns_in_it() -> None:
+def test_stable_baselines3_learns_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path))
     identifier = tsbench.gym.identifier("laikago_trot")
     check_env(gymnasium.make(identifier).unwrapped)
     vectorised = make_vec_env(identifier, n_envs=2, seed=0)

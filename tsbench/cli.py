@@ -296,6 +296,8 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
             raise TsbenchError(f"expected task=NAME, not {word!r}")
         if name not in tasks.names():
             raise unknown("task", name, tasks.names())
+    if trust_sb3 is not None and path.suffix != ".zip":
+        raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
     if path.is_dir():
         policy, task = record.read_policy(path)
         if name not in (None, task.name):

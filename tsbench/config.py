@@ -159,7 +159,12 @@ def parse_words(words: Sequence[str]) -> list[Override]:
         TsbenchError: one of them cannot be read.
     """
     with one_line_errors():
-        return list(OverridesParser.create().parse_overrides(list(words)))
+        overrides = list(OverridesParser.create().parse_overrides(list(words)))
+    for override in overrides:
+        group, _, rest = override.key_or_group.partition(".")
+        if group in ("task", "method") and rest == "name":
+            raise TsbenchError(f"{group}.name comes with {group}=NAME and cannot be changed alone")
+    return overrides
 
 
 def names(group: str) -> tuple[str, ...]:

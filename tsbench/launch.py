@@ -56,8 +56,17 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
         raise TsbenchError("--json is for one run; each of a sweep's has its score.json")
     if not any(getattr(flags, name) for name in (*OWN_SEARCH_PATH, *NO_JOB)):
         jobs = config.sweep(flags.overrides) if flags.multirun else [list(flags.overrides)]
+        places: set[str] = set()
         for job in islice(jobs, CHECKED_JOBS):
-            run.prepare(config.compose(job))
+            chosen = config.compose(job)
+            run.prepare(chosen)
+            if chosen.directory in places:
+                raise TsbenchError(
+                    f"directory={chosen.directory} would be the place of several of the sweep's "
+                    "runs: without it each has its own"
+                )
+            if chosen.directory is not None:
+                places.add(chosen.directory)
 
     failures: list[tuple[str, Path, Exception]] = []
     parent = os.getpid()

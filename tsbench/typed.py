@@ -21,7 +21,7 @@ def typed(kind: Any, value: Any, path: str) -> Any:
         path: the dotted key, for messages.
 
     Raises:
-        TsbenchError: a key is missing or unknown, or a value has the wrong type.
+        TsbenchError: a key is missing or unknown, or a value has the wrong type or range.
     """
     if is_dataclass(kind) and isinstance(kind, type):
         given = typed_items(kind, value, path)
@@ -31,7 +31,7 @@ def typed(kind: Any, value: Any, path: str) -> Any:
         try:
             return kind(**given)
         except ValueError as error:  # from __post_init__
-            raise TsbenchError(str(error)) from None
+            raise TsbenchError(_join(path, str(error))) from None
     if kind is Any:
         return value
     origin, arguments = get_origin(kind), get_args(kind)

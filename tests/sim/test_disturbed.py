@@ -147,12 +147,12 @@ def test_every_environment_has_its_own_physics_for_good() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"push": -1.0}, "disturb.push must not be negative"),
-        ({"rise": -1}, "disturb.rise must not be negative"),
-        ({"calm": 1.0}, r"disturb.calm must lie in \[0, 1\)"),
-        ({"duration": 2.0}, "at most disturb.interval"),
-        ({"mass": 1.0}, r"disturb.mass must lie in \[0, 1\)"),
-        ({"friction": -0.1}, r"disturb.friction must lie in \[0, 1\)"),
+        ({"push": -1.0}, "push must not be negative"),
+        ({"rise": -1}, "rise must not be negative"),
+        ({"calm": 1.0}, r"calm must lie in \[0, 1\)"),
+        ({"duration": 2.0}, "at most the interval"),
+        ({"mass": 1.0}, r"mass must lie in \[0, 1\)"),
+        ({"friction": -0.1}, r"friction must lie in \[0, 1\)"),
     ],
 )
 def test_values_that_make_no_sense(wrong: dict[str, Any], message: str) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tsbench.errors import TsbenchError
 from tsbench.viewer.pushes import parse_push
+from tsbench.viewer.subject import pair, subject
 
 
 @pytest.mark.parametrize(
@@ -34,3 +38,13 @@ def test_pushes_in_words(text: str, time: float, force: tuple[float, float, floa
 def test_what_is_no_push_is_told_what_one_is(text: str) -> None:
     with pytest.raises(TsbenchError, match=r"cannot read the push .*such as 100N@0\.5s:\+y"):
         parse_push(text)
+
+
+def test_a_push_after_the_end_is_refused(make_run: Callable[..., Path]) -> None:
+    run = str(make_run("rocket_navigation"))
+    assert subject(run).show(parse_push("9N@3.6s:+x")).title
+    late = parse_push("9N@3.7s:+x")  # it has fallen out of the world by then
+    with pytest.raises(TsbenchError, match=r"a push at 3\.7 s comes after .* end at 3\.68 s"):
+        subject(run).show(late)
+    with pytest.raises(TsbenchError, match="comes after"):
+        pair([run, run], late)

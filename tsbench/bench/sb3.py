@@ -186,6 +186,9 @@ class Rival:
             device="cpu",
         )
         self.model.lr_schedule = rate
+        # Without a logger of its own it leaves an empty folder in the system's temporary one.
+        logging: Any = importlib.import_module("stable_baselines3.common.logger")
+        self.model.set_logger(logging.Logger(folder=None, output_formats=[]))
 
     def learn(self, ours: Outcome, score: Judge) -> Outcome:
         """Until it scores as ours does, or has taken `PATIENCE` times as long."""

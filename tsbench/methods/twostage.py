@@ -35,9 +35,9 @@ class Options:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.explore <= 1.0:
-            raise ValueError(f"method.explore must lie in [0, 1], not {self.explore}")
+            raise ValueError(f"explore must lie in [0, 1], not {self.explore}")
         if not 0.0 <= self.finetune < 1.0:
-            raise ValueError(f"method.finetune must lie in [0, 1), not {self.finetune}")
+            raise ValueError(f"finetune must lie in [0, 1), not {self.finetune}")
 
 
 def train(problem: Problem, workspace: Workspace) -> Policy:

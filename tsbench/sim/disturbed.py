@@ -43,14 +43,14 @@ class Disturbances:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.push < math.inf:
-            raise ValueError(f"disturb.push must not be negative, not {self.push}")
+            raise ValueError(f"push must not be negative, not {self.push}")
         if self.rise < 0:
-            raise ValueError(f"disturb.rise must not be negative, not {self.rise}")
+            raise ValueError(f"rise must not be negative, not {self.rise}")
         if not 0.0 < self.duration <= self.interval < math.inf:
-            raise ValueError("disturb.duration must be positive and at most disturb.interval")
+            raise ValueError("duration must be positive and at most the interval")
         for name in ("calm", "mass", "friction", "strength"):
             if not 0.0 <= getattr(self, name) < 1.0:
-                raise ValueError(f"disturb.{name} must lie in [0, 1), not {getattr(self, name)}")
+                raise ValueError(f"{name} must lie in [0, 1), not {getattr(self, name)}")
 
 
 class DisturbedPhysics(Physics[S]):

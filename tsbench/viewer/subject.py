@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from tsbench import record, tables, tasks
 from tsbench.errors import TsbenchError
 from tsbench.mdp import Task
@@ -43,7 +45,8 @@ class Subject:
     def show(self, push: Push | None = None) -> Show:
         """
         Raises:
-            TsbenchError: a push on what no policy holds up, or a policy for another task.
+            TsbenchError: a push on what no policy holds up or after the end, or a policy for
+                another task.
         """
         plan = self.plan()
         if self.policy is None:
@@ -51,7 +54,9 @@ class Subject:
                 raise TsbenchError("only what a policy executes can be pushed, not a plan")
             assert plan is not None
             return compose_plan(plan, title=self.title, verdict=planned_in_words(plan))
-        return self.show_of(record_episode(self.task, self.policy, push), plan)
+        recording = record_episode(self.task, self.policy, push)
+        check_pushed(push, [recording])
+        return self.show_of(recording, plan)
 
     def show_of(self, recording: Recording, plan: Recording | None) -> Show:
         """What was executed beside what was planned."""
@@ -130,10 +135,12 @@ def pair(runs: Sequence[str], push: Push | None = None) -> Show:
     """Two runs of one task beside each other.
 
     Raises:
-        TsbenchError: they are for different tasks, or one of them is damaged.
+        TsbenchError: they are for different tasks, one of them is damaged, or the push comes after
+            the end of both.
     """
     subjects = [run_subject(Path(word)) for word in runs]
     recordings = [record_episode(s.task, cast(Policy, s.policy), push) for s in subjects]
+    check_pushed(push, recordings)
     verdict = " ".join(
         f"{name} is {one.title}. {executed_in_words(recording)}"
         for name, one, recording in zip("AB", subjects, recordings, strict=True)
@@ -141,6 +148,16 @@ def pair(runs: Sequence[str], push: Push | None = None) -> Show:
     title = f"{subjects[0].task.name}: two policies"
     a, b = recordings
     return compose_pair(a, b, title=title, verdict=verdict)
+
+
+def check_pushed(push: Push | None, recordings: Sequence[Recording]) -> None:
+    """
+    Raises:
+        TsbenchError: the push comes when every episode has ended, so that nobody would see it.
+    """
+    end = max(recording.duration for recording in recordings)
+    if push is not None and (begins := float(np.min(push.time))) >= end:
+        raise TsbenchError(f"a push at {begins:g} s comes after the episode's end at {end:.3g} s")
 
 
 def planned_in_words(plan: Recording) -> str:
