@@ -331,9 +331,13 @@ def _view(words: Sequence[str]) -> None:
     parser.add_argument("--compare", nargs=2, metavar="RUN", help="two runs of one task instead")
     push = "push the robot for 0.1 s, e.g. 100N@0.5s:+y: newtons, when, where to (axis or degrees)"
     parser.add_argument("--push", metavar="PUSH", help=push)
-    parser.add_argument("--html", type=Path, metavar="FILE", help="write a page, open no server")
-    parser.add_argument("--video", type=Path, metavar="FILE", help="write an MP4")
-    parser.add_argument("--strip", type=Path, metavar="FILE", help="write a PNG of some moments")
+    files = {
+        "--html": "write a page, open no server",
+        "--video": "write an MP4",
+        "--strip": "write a PNG of some moments",
+    }
+    for flag, purpose in files.items():
+        parser.add_argument(flag, type=_new_file, metavar="FILE", help=purpose)
     port = "of the live view (any that is free)"
     parser.add_argument("--port", type=_port, metavar="N", default=0, help=port)
     options = parser.parse_args(words)
