@@ -19,7 +19,7 @@ class Budget:
         plan: environment steps of the planning variant.
         act: environment steps of the task or its imitation variant. A method without a planning
             stage may use both (paper: monolithic gets the sum).
-        environments: how many are stepped together, instead of the training settings' number.
+        environments: how many are stepped together at most, whatever the training settings say.
     """
 
     plan: int

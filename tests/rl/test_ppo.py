@@ -300,7 +300,9 @@ def test_settings() -> None:
     assert chosen.hidden == (32, 16)
     assert (chosen.discount, chosen.desired_kl) == (1.0, None)
     assert settings(problem(plan={"entropy": 0.5}), "task") == StageSettings()
-    assert settings(problem(16, plan={"environments": 999}), "plan").environments == 16
+    for asked, given in ((999, 16), (8, 8), (None, 16)):
+        plan = {} if asked is None else {"environments": asked}
+        assert settings(problem(16, plan=plan), "plan").environments == given
     # The last stage goes on with the imitation's network.
     both = problem(imitate={"hidden": [8], "entropy": 0.1}, finetune={"entropy": 0.2})
     assert settings(both, "finetune") == StageSettings(hidden=(8,), entropy=0.2)

@@ -40,8 +40,8 @@ def settings(problem: Problem, kind: str) -> StageSettings:
     for name in ("imitate", "finetune") if kind == "finetune" else (kind,):
         given = problem.training.get(name, {})
         changes |= typed_items(StageSettings, given, f"task.training.{name}")
-    if problem.budget.environments is not None:
-        changes["environments"] = problem.budget.environments
+    if (most := problem.budget.environments) is not None:
+        changes["environments"] = min(changes.get("environments", most), most)
     if kind == "plan" and changes.get("disturb", Disturbances()) != Disturbances():
         raise TsbenchError("task.training.plan.disturb: planning has no physics to disturb")
     if changes.get("disturb", Disturbances()).interval < problem.task.timestep:
