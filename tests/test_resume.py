@@ -201,7 +201,7 @@ def test_the_learner_goes_on_to_the_last_bit(
     )
     chosen = PPOSettings(
         environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,), entropy=0.01,
-        desired_kl=0.001, final_std=0.1, noise_correlation=0.5,
+        desired_kl=0.001, final_std=0.1,
     )  # fmt: skip
 
     def learner(name: str, seed: int) -> Learner:

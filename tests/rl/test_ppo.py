@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
@@ -19,7 +18,7 @@ from tsbench.errors import NotFiniteError
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS, Policy
 from tsbench.problem import Budget, Problem
-from tsbench.rl.ppo import CorrelatedGaussian, Learner, PPOSettings, Storage
+from tsbench.rl.ppo import Learner, PPOSettings, Storage
 from tsbench.rl.stages import StageSettings, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment, Physics
@@ -103,46 +102,6 @@ def test_minibatches_are_those_of_rsl_rl() -> None:
             assert torch.equal(getattr(mine, name), getattr(wanted, name))
         pairs = zip(mine.old_distribution_params, wanted.old_distribution_params, strict=True)
         assert all(torch.equal(a, b) for a, b in pairs)
-
-
-def drawn(correlation: float, count: int) -> np.ndarray:
-    """Actions less their mean, over their spread, of 4,000 environments, one after another."""
-    torch.manual_seed(3)
-    policy = CorrelatedGaussian(2, 0.3, correlation)
-    mean = torch.full((4000, 2), 5.0)
-    with torch.inference_mode():
-        policy.update(mean)
-        actions = [policy.sample() for _ in range(count)]
-    return (torch.stack(actions).numpy() - 5.0) / 0.3
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.8])
-def test_noise_lasts_and_is_as_large_as_ever(correlation: float) -> None:
-    noise = drawn(correlation, 4)
-    np.testing.assert_allclose(noise.std(axis=(1, 2)), 1.0, atol=0.03)
-    for lag in (1, 2, 3):
-        seen = np.mean(noise[0] * noise[lag])
-        assert seen == pytest.approx(correlation**lag, abs=0.05)
-    assert abs(np.mean(noise[..., 0] * noise[..., 1])) < 0.03  # each action has its own
-
-
-def test_white_noise_is_that_of_rsl_rl() -> None:
-    theirs = GaussianDistribution(2, 0.3)
-    torch.manual_seed(3)
-    with torch.inference_mode():
-        theirs.update(torch.full((4000, 2), 5.0))
-        wanted = np.stack([theirs.sample().numpy() for _ in range(3)])
-    np.testing.assert_array_equal(drawn(0.0, 3), (wanted - 5.0) / 0.3)
-
-
-def test_an_update_leaves_the_noise_alone() -> None:
-    policy = CorrelatedGaussian(1, 0.3, 0.5)
-    policy.update(torch.zeros(4, 1))
-    with torch.inference_mode():
-        policy.sample()
-    before = policy.noise
-    policy.sample()
-    assert policy.noise is before
 
 
 def test_steps_are_counted() -> None:
@@ -329,7 +288,6 @@ def test_settings() -> None:
         ({"initial_std": -1.0}, r"initial_std must be positive"),
         ({"discount": 1.01}, r"discount must lie in \[0, 1\]"),
         ({"gae_lambda": -0.1}, r"gae_lambda must lie in \[0, 1\]"),
-        ({"noise_correlation": 1.0}, r"noise_correlation must lie in \[0, 1\)"),
         ({"activation": "selu"}, r"activation must be one of elu, relu, tanh"),
         ({"final_learning_rate": 1e-4}, "final_learning_rate needs desired_kl: null"),
         ({"final_learning_rate": 1.0, "desired_kl": None}, "final_learning_rate must be positive"),

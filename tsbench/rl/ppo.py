@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
-from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 
 from tsbench.errors import NotFiniteError, TsbenchError
@@ -55,9 +54,6 @@ class PPOSettings:
     final_std: what it is held below at the end of a stage, by a bound that falls geometrically
         from `initial_std`; None for no bound. Where actions have dead zones, a policy can live on
         its own noise, and its mean alone then fails.
-    noise_correlation: of the noise of one action with that of the environment's next; 0 is white
-        noise. Noise that lasts explores farther where actions act slowly, and a policy cannot use
-        it in place of its own fine control, as it does white noise at the edge of a dead zone.
     bootstrap: whether an episode's last step counts as if it went on.
     """
 
@@ -80,7 +76,6 @@ class PPOSettings:
     encoding: str = "plain"
     initial_std: float = 1.0
     final_std: float | None = None
-    noise_correlation: float = 0.0
     bootstrap: bool = True
 
     def __post_init__(self) -> None:
@@ -104,8 +99,6 @@ class PPOSettings:
                 raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
         if self.desired_kl is not None and not 0.0 < self.desired_kl < math.inf:
             raise ValueError(f"desired_kl must be positive or null, not {self.desired_kl}")
-        if not 0.0 <= self.noise_correlation < 1.0:
-            raise ValueError(f"noise_correlation must lie in [0, 1), not {self.noise_correlation}")
         for name in ("discount", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
@@ -117,34 +110,6 @@ class PPOSettings:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}")
         if self.encoding not in ENCODINGS:
             raise ValueError(f"encoding must be one of {', '.join(ENCODINGS)}")
-
-
-class CorrelatedGaussian(GaussianDistribution):
-    """rsl-rl's Gaussian policy with noise that lasts from step to step.
-
-    e_t = c e_{t-1} + sqrt(1 - c^2) n_t, n_t white: each e_t is distributed as n_t, so that the
-    probabilities of single actions, all that PPO looks at, stay what they are (Hollenstein et al.,
-    Colored Noise in PPO, AAAI 2024).
-
-    Attributes:
-        noise: the last one that was acted with, shape (environments, actions), None before.
-    """
-
-    def __init__(self, output_dim: int, init_std: float, correlation: float) -> None:
-        super().__init__(output_dim, init_std)
-        self.correlation = correlation
-        self.noise: torch.Tensor | None = None
-
-    def sample(self) -> torch.Tensor:
-        # With gradients on this is an update, which draws actions that nobody takes.
-        if self.correlation == 0.0 or torch.is_grad_enabled():
-            return super().sample()
-        fresh = torch.randn_like(self.mean)
-        if self.noise is not None:
-            c = self.correlation
-            fresh = c * self.noise + math.sqrt(1.0 - c * c) * fresh
-        self.noise = fresh
-        return self.mean + self.std * fresh
 
 
 class Storage(RolloutStorage):
@@ -202,11 +167,7 @@ class Learner:
         }  # fmt: skip
         actor = MLPModel(
             observation, groups, "actor", env.num_actions, **shared,
-            distribution_cfg={
-                "class_name": CorrelatedGaussian,
-                "init_std": s.initial_std,
-                "correlation": s.noise_correlation,
-            },
+            distribution_cfg={"class_name": "GaussianDistribution", "init_std": s.initial_std},
         )  # fmt: skip
         with torch.no_grad():  # at first every mean action is nearly zero: the nominal pose
             actor.mlp[-1].weight.mul_(0.01)
@@ -340,9 +301,6 @@ class Learner:
             },
             "learning_rate": ppo.learning_rate,
             "rng": torch.get_rng_state().numpy(),
-            "noise": None
-            if ppo.actor.distribution.noise is None
-            else ppo.actor.distribution.noise.numpy(),
             "environment": self._env.snapshot(),
             "episodes": {
                 "returns": list(self._returns),
@@ -370,8 +328,6 @@ class Learner:
             ppo.optimizer.load_state_dict({"state": moments, "param_groups": groups})
             ppo.learning_rate = snapshot["learning_rate"]
             torch.set_rng_state(torch.from_numpy(snapshot["rng"]))
-            noise = snapshot["noise"]
-            ppo.actor.distribution.noise = None if noise is None else torch.from_numpy(noise)
             self._env.restore(snapshot["environment"])
             episodes = snapshot["episodes"]
             self._returns.extend(episodes["returns"])
