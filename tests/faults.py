@@ -324,7 +324,8 @@ class Campaign:
 
     def no_memory(self) -> None:
         """Too little from the start, and no more to be had in the midst of training."""
-        words = [*RUNS[SUBJECT], "task.budgets.smoke.environments=3_000_000"]
+        many = ["task.budgets.smoke.environments=null", "task.training.plan.environments=3_000_000"]
+        words = [*RUNS[SUBJECT], *many]
         folder = self.folder / "too large"
         limit = 4 << 30
         process = Process(
