@@ -44,7 +44,8 @@ def settings(problem: Problem, kind: str) -> StageSettings:
         changes["environments"] = min(changes.get("environments", most), most)
     if kind == "plan" and changes.get("disturb", Disturbances()) != Disturbances():
         raise TsbenchError("task.training.plan.disturb: planning has no physics to disturb")
-    if changes.get("disturb", Disturbances()).interval < problem.task.timestep:
+    disturb = changes.get("disturb")
+    if disturb is not None and disturb.interval < problem.task.timestep:
         step = f"a control step of {problem.task.timestep:.3g} s"
         raise TsbenchError(f"task.training.{kind}.disturb.interval must be at least {step}")
     try:
