@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Self, TypeVar, cast
 
+import array_api_compat
 import mujoco
 import numpy as np
 
@@ -23,6 +24,17 @@ from tsbench.motion import Audit, Plan, ReferenceMotion
 Array = Any  # an array of any library that follows the array API standard
 Rng = np.random.Generator
 Vector = tuple[float, float, float]
+
+
+def array_namespace(array: Array) -> Any:
+    """The functions of the array API standard, of the library that made `array`.
+
+    numpy keeps the standard itself. array_api_compat takes 12 us to say so, and its clip, for
+    instance, 49 us instead of 6: with some dozens of rockets that was a third of a step.
+    """
+    if type(array) is np.ndarray:
+        return np
+    return array_api_compat.array_namespace(array)
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
-from array_api_compat import array_namespace
 
-from tsbench.mdp import Abstraction, Array, Readings, Rng, S, Start, Task
+from tsbench.mdp import Abstraction, Array, Readings, Rng, S, Start, Task, array_namespace
 from tsbench.motion import Audit, Plan, ReferenceMotion
 
 

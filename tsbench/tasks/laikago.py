@@ -13,10 +13,20 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from array_api_compat import array_namespace
 from scipy.interpolate import PchipInterpolator
 
-from tsbench.mdp import Abstraction, Array, Drawing, Readings, Rng, Start, State, Task, Tracker
+from tsbench.mdp import (
+    Abstraction,
+    Array,
+    Drawing,
+    Readings,
+    Rng,
+    Start,
+    State,
+    Task,
+    Tracker,
+    array_namespace,
+)
 from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
 from tsbench.planning.ik import FootPoses
 from tsbench.sim.model import compiled, load_spec

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from array_api_compat import array_namespace
 
 from tsbench.mdp import (
     Abstraction,
@@ -24,6 +23,7 @@ from tsbench.mdp import (
     State,
     Task,
     Tracker,
+    array_namespace,
 )
 from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
 from tsbench.sim.model import load_spec
@@ -407,7 +407,8 @@ class Rocket(Task[RocketState]):
 
         def reward(previous: RocketState, action: Array, state: RocketState) -> Array:
             xp = array_namespace(state.position)
-            distance, progress = path.project(state.position)
+            positions = xp.stack([previous.position, state.position])
+            (_, distance), (before, progress) = path.project(positions)
             collision = xp.astype(self.violated(state), state.position.dtype)
             penalty = TRACKING_PENALTY * collision
             closeness = xp.exp(TRACKING_DECAY * distance)
@@ -416,8 +417,7 @@ class Rocket(Task[RocketState]):
             length = path.lengths[-1]
             remaining = (1.0 - progress) * length
             worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / TRACKING_ARRIVAL)
-            advance = (progress - path.project(previous.position)[1]) * length
-            advance = xp.clip(advance, *TRACKING_LIMITS)
+            advance = xp.clip((progress - before) * length, *TRACKING_LIMITS)
             return closeness * worth + TRACKING_ADVANCE * advance - penalty
 
         def start(rng: Rng, count: int) -> Start:
@@ -479,24 +479,21 @@ class Path:
             - 2.0 * position[..., None, 0] * vertices[:, 0]
             - 2.0 * position[..., None, 1] * vertices[:, 1]
         )
-        nearest = xp.argmin(squared, axis=-1)
-        best_distance, best_length = None, None
-        for offset in (-1, 0):
-            index = xp.clip(nearest + offset, 0, len(self.vertices) - 2)
-            a, b = vertices[index], vertices[index + 1]
-            along = b - a
-            length = lengths[index + 1] - lengths[index]
-            share = xp.sum((position - a) * along, axis=-1) / (length * length)
-            share = xp.clip(share, 0.0, 1.0)
-            distance = xp.linalg.vector_norm(position - (a + share[..., None] * along), axis=-1)
-            travelled = lengths[index] + share * length
-            if best_distance is None:
-                best_distance, best_length = distance, travelled
-            else:
-                nearer = distance < best_distance
-                best_distance = xp.where(nearer, distance, best_distance)
-                best_length = xp.where(nearer, travelled, best_length)
-        return best_distance, best_length / self.lengths[-1]
+        nearest = xp.argmin(squared, axis=-1)[..., None] + xp.asarray([-1, 0])
+        index = xp.clip(nearest, 0, len(self.vertices) - 2)  # of two segments, shape (..., 2)
+        a, b = vertices[index], vertices[index + 1]
+        along = b - a
+        length = lengths[index + 1] - lengths[index]
+        position = position[..., None, :]
+        share = xp.sum((position - a) * along, axis=-1) / (length * length)
+        share = xp.clip(share, 0.0, 1.0)
+        distance = xp.linalg.vector_norm(position - (a + share[..., None] * along), axis=-1)
+        travelled = (lengths[index] + share * length) / lengths[-1]
+        first = distance[..., 0] <= distance[..., 1]
+        return (
+            xp.where(first, distance[..., 0], distance[..., 1]),
+            xp.where(first, travelled[..., 0], travelled[..., 1]),
+        )
 
 
 def _rocket(name: str, distance: float, obstacles: tuple[tuple[float, float], ...]) -> Rocket:
