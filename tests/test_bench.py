@@ -18,6 +18,7 @@ from tsbench.cli import main
 from tsbench.errors import TsbenchError
 from tsbench.motion import ReferenceMotion
 from tsbench.rl.ppo import PPOSettings
+from tsbench.sim import gym, single
 from tsbench.sim.tracking import Imitation
 
 TINY = Effort(repeats=2, seconds=0.01, count=6, counts=(1, 3), iterations=1, budget="smoke")
@@ -77,20 +78,40 @@ def test_the_rival_is_given_our_settings(
     imitation = Imitation(tasks.make(name), naive_reference(name))
     chosen = PPOSettings(
         environments=2, rollout=8, epochs=1, minibatches=2, hidden=(5, 4), activation="elu",
-        encoding="symlog", desired_kl=None, learning_rate=1e-3, final_learning_rate=1e-5,
+        encoding="symlog", desired_kl=None, learning_rate=1e-3, final_learning_rate=1e-5, repeat=3,
     )  # fmt: skip
-    rival = sb3.Rival(imitation, chosen, 0, steps=32)
+    rival = sb3.Rival(imitation, chosen, 0, steps=96)
     actor = rival.model.policy.mlp_extractor.policy_net
     assert [type(layer).__name__ for layer in actor] == ["Linear", "ELU", "Linear", "ELU"]
     assert [layer.out_features for layer in actor[::2]] == [5, 4]
     rates = []
-    for _ in range(3):  # sixteen steps each
+    for _ in range(3):  # sixteen actions each, of three steps
         rival.model.learn(16, reset_num_timesteps=False)
         rates.append(rival.model.policy.optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-4, 1e-5, 1e-5])
+    assert rival.steps == 144
     assert not logs.exists()
     far = np.full((1, imitation.observation_size), 1e6)
     assert np.all(np.isfinite(rival(far)))
+
+
+def test_the_rival_holds_its_actions() -> None:
+    """For four steps, less where the episode ends; what is missing there earns nothing."""
+    task = tasks.make("rocket_navigation", distance=3.0)
+    plain, environment = (gym.GymEnvironment(single.environment(task)) for _ in range(2))
+    held = sb3.Held(environment, 4)
+    action = np.array([1.0, 0.0])
+    plain.reset(seed=0)
+    held.reset(seed=0)
+    left = task.horizon
+    while left > 0:
+        steps = [plain.step(action) for _ in range(min(left, 4))]
+        observation, reward, terminated, truncated, _ = held.step(action)
+        np.testing.assert_array_equal(observation, steps[-1][0])
+        assert reward == pytest.approx(sum(step[1] for step in steps) / 4)
+        left -= 4
+        assert (terminated, truncated) == (False, left <= 0)
+    assert task.horizon % 4  # the last hold is cut short
 
 
 def test_a_missing_package_is_named_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -245,6 +245,41 @@ def test_what_rsl_rl_sees() -> None:
     assert environment.episode_length_buf.tolist() == [0, 9]
 
 
+def test_held_actions() -> None:
+    """Three steps an action. One episode leaves the world in the second step of a hold; what begins
+    then stands still for the third, unrewarded. Another has its last step in the first."""
+    subject = planning()
+    plain, held = (BatchedEnvironment(subject, subject, 2, 0) for _ in range(2))
+    stepped, environment = TorchEnvironment(plain), TorchEnvironment(held, repeat=3)
+    for batch in (plain, held):  # at -10 m, the border, in the fifth step
+        position = np.array([[0.0, 0.0], [-8.85, 0.0]])
+        batch.state = batch.state.replace(position=position)
+    actions = torch.tensor([[0.5, 0.5, 0.0], [-1.0, 0.0, 0.0]])
+    rewards = torch.stack([stepped.step(actions)[1] for _ in range(3)]).sum(dim=0)
+    _, reward, done, _ = environment.step(actions)
+    torch.testing.assert_close(reward, rewards / 3)
+    assert done.tolist() == [0, 0]
+    _, reward, done, extras = environment.step(actions)
+    alive = torch.stack([stepped.step(actions)[1] for _ in range(2)])[:, 1].sum()
+    torch.testing.assert_close(reward[1], alive / 3)
+    assert (done.tolist(), extras["time_outs"].tolist()) == ([0, 1], [0.0, 0.0])
+    np.testing.assert_array_equal(held.state.position[1], [0.0, 0.0])
+    assert environment.episode_length_buf.tolist() == [6, 1]
+    held.steps[0] = 14  # its last step is the first of the hold
+    *_, done, extras = environment.step(actions)
+    assert (done.tolist(), extras["time_outs"].tolist()) == ([1, 0], [1.0, 0.0])
+
+
+def test_held_actions_are_counted_as_steps() -> None:
+    """8 environments x 16 actions x 3 steps; the discount is one step's."""
+    taught = learner(replace(TINY, repeat=3, discount=0.9))
+    reports: list[tuple[int, Mapping[str, float]]] = []
+    taught.learn(385, lambda steps, metrics: reports.append((steps, dict(metrics))))
+    assert [steps for steps, _ in reports] == [384, 768]
+    assert reports[-1][1]["episode_length"] == 15.0
+    assert taught._ppo.gamma == pytest.approx(0.729)
+
+
 # Settings
 
 

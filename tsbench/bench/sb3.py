@@ -3,10 +3,10 @@
 Ours trains in two stages with budget=fast, to its end. Stable-Baselines3 then learns to imitate
 the same reference motion, until its deterministic policy scores as much from the task's own start;
 that it stops there, and that its plan is a gift, are in its favour. Its settings are ours wherever
-it has them: networks, environments, steps between updates, epochs, minibatches, discounts,
-clipping, entropy, first spread, a falling learning rate; observations are encoded as ours and
-normalised by its VecNormalize. It has no bound for the spread, and where ours adapts the learning
-rate to a KL divergence, it keeps its default of 3e-4. Its environments are those of
+it has them: networks, environments, steps between updates, held actions, epochs, minibatches,
+discounts, clipping, entropy, first spread, a falling learning rate; observations are encoded as
+ours and normalised by its VecNormalize. It has no bound for the spread, and where ours adapts the
+learning rate to a KL divergence, it keeps its default of 3e-4. Its environments are those of
 `tsbench.sim.gym` in one process, its default: on two cores a loop was faster than processes (the
 `loop` and `async` figures). Torch has one thread in both. Judging policies is not timed.
 """
@@ -135,6 +135,24 @@ def train(problem: Problem, folder: Path) -> Outcome:
     return Outcome(*judge(problem.task)(policy), imitate.seconds, imitate.steps)
 
 
+class Held(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+    """Holds every action for some steps, or until the episode ends. As in `rl.vec_env`, the reward
+    is the sum of theirs over their number."""
+
+    def __init__(self, environment: gymnasium.Env[np.ndarray, np.ndarray], repeat: int) -> None:
+        super().__init__(environment)
+        self.repeat = repeat
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        total = 0.0
+        for _ in range(self.repeat):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total += float(reward)
+            if terminated or truncated:
+                break
+        return observation, total / self.repeat, terminated, truncated, info
+
+
 class Rival:
     """Stable-Baselines3's PPO in an imitation variant.
 
@@ -150,16 +168,17 @@ class Rival:
         vectors: Any = importlib.import_module("stable_baselines3.common.vec_env")
         torch_nn: Any = importlib.import_module("torch.nn")
         self._encode = ENCODINGS[chosen.encoding]
+        self._repeat = chosen.repeat
 
         def make() -> gymnasium.Env[Any, Any]:
-            plain = GymEnvironment(environment(imitation))
+            plain = Held(GymEnvironment(environment(imitation)), chosen.repeat)
             return TransformObservation(plain, self._encode, plain.observation_space)
 
         def rate(_: float) -> float:
             if chosen.desired_kl is not None:
                 return LEARNING_RATE
             final = chosen.final_learning_rate or chosen.learning_rate
-            share = min(self.model.num_timesteps / steps, 1.0)
+            share = min(self.steps / steps, 1.0)
             return float(chosen.learning_rate * (final / chosen.learning_rate) ** share)
 
         environments = [make] * chosen.environments
@@ -171,7 +190,7 @@ class Rival:
             n_steps=chosen.rollout,
             batch_size=chosen.environments * chosen.rollout // chosen.minibatches,
             n_epochs=chosen.epochs,
-            gamma=chosen.discount,
+            gamma=chosen.discount**chosen.repeat,
             gae_lambda=chosen.gae_lambda,
             clip_range=chosen.clip,
             ent_coef=chosen.entropy,
@@ -190,17 +209,23 @@ class Rival:
         logging: Any = importlib.import_module("stable_baselines3.common.logger")
         self.model.set_logger(logging.Logger(folder=None, output_formats=[]))
 
+    @property
+    def steps(self) -> int:
+        """Environment steps so far; Stable-Baselines3 counts actions. Of the last hold of an
+        episode, which its end may cut short, all."""
+        return int(self.model.num_timesteps) * self._repeat
+
     def learn(self, ours: Outcome, score: Judge) -> Outcome:
         """Until it scores as ours does, or has taken `PATIENCE` times as long."""
         seconds = 0.0
         while True:
             began = time.perf_counter()
-            self.model.learn(ours.steps // CHECKS, reset_num_timesteps=False)
+            self.model.learn(ours.steps // CHECKS // self._repeat, reset_num_timesteps=False)
             seconds += time.perf_counter() - began
             reached, solved = score(self)
             if reached >= ours.score or seconds > PATIENCE * ours.seconds:
                 self._vector.close()
-                return Outcome(reached, solved, seconds, int(self.model.num_timesteps))
+                return Outcome(reached, solved, seconds, self.steps)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         normalised = self._vector.normalize_obs(self._encode(observation))

@@ -34,7 +34,7 @@ def compare(effort: Effort) -> Findings:
         problem = prepare(compose([f"task={name}"]))
         for stage in ("plan", "imitate"):
             chosen = settings(problem, stage)
-            steps = chosen.environments * chosen.rollout
+            steps = chosen.steps
             rows = train(problem, stage, steps * (effort.iterations + 1))
             findings.add(split(f"{name}.{stage}", rows, steps))
     return findings

@@ -33,11 +33,13 @@ Report = Callable[[int, Mapping[str, float]], None]  # (environment steps so far
 class PPOSettings:
     """Attributes:
     environments: episodes stepped together.
-    rollout: steps of each between two updates.
+    rollout: actions of each between two updates.
+    repeat: time steps for which an action is held while learning, so that it does enough to be
+        told from noise where a time step is short. The policy itself acts in every time step.
     epochs: passes over the collected steps in an update.
     minibatches: per pass.
-    discount: gamma.
-    gae_lambda: of generalised advantage estimation.
+    discount: gamma, per time step.
+    gae_lambda: of generalised advantage estimation, per action.
     clip: range of the probability ratio.
     clip_value: whether the value loss is clipped too.
     entropy: weight of the entropy bonus.
@@ -59,6 +61,7 @@ class PPOSettings:
 
     environments: int = 512
     rollout: int = 24
+    repeat: int = 1
     epochs: int = 5
     minibatches: int = 4
     discount: float = 0.99
@@ -79,7 +82,7 @@ class PPOSettings:
     bootstrap: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("environments", "rollout", "epochs", "minibatches"):
+        for name in ("environments", "rollout", "repeat", "epochs", "minibatches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         for name in ("learning_rate", "gradient_norm", "initial_std", "clip"):
@@ -110,6 +113,11 @@ class PPOSettings:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}")
         if self.encoding not in ENCODINGS:
             raise ValueError(f"encoding must be one of {', '.join(ENCODINGS)}")
+
+    @property
+    def steps(self) -> int:
+        """Environment steps between two updates, all environments together."""
+        return self.environments * self.rollout * self.repeat
 
 
 class Storage(RolloutStorage):
@@ -143,7 +151,7 @@ class Learner:
         torch.manual_seed(seed)
         self.settings = settings
         self.environment = environment
-        self._env = TorchEnvironment(environment, settings.encoding)
+        self._env = TorchEnvironment(environment, settings.encoding, settings.repeat)
         self.steps = 0
         self._returns: deque[float] = deque(maxlen=100)
         self._lengths: deque[int] = deque(maxlen=100)
@@ -181,7 +189,7 @@ class Learner:
             num_learning_epochs=s.epochs,
             num_mini_batches=s.minibatches,
             clip_param=s.clip,
-            gamma=s.discount,
+            gamma=s.discount**s.repeat,
             lam=s.gae_lambda,
             value_loss_coef=s.value_weight,
             entropy_coef=s.entropy,
@@ -215,7 +223,7 @@ class Learner:
                 ppo.compute_returns(observation)
             collected = time.perf_counter()
             losses = self._update()
-            self.steps += env.num_envs * self.settings.rollout
+            self.steps += self.settings.steps
             self._settle(min(self.steps / steps, 1.0))
             if report is not None:
                 metrics = {
@@ -280,8 +288,9 @@ class Learner:
                 group["lr"] = rate
 
     def _count(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
-        self._return += rewards.numpy()
-        self._length += 1
+        repeat = self.settings.repeat  # an episode's last hold counts in full
+        self._return += rewards.numpy() * repeat
+        self._length += repeat
         ended = np.flatnonzero(dones.numpy())
         self._returns.extend(self._return[ended].tolist())
         self._lengths.extend(self._length[ended].tolist())

@@ -15,16 +15,20 @@ from tsbench.sim.batched import BatchedEnvironment
 
 
 class TorchEnvironment(VecEnv):
-    """Float32 tensors on the CPU over a batched environment, its observations encoded.
+    """Float32 tensors on the CPU over a batched environment, its observations encoded, and each
+    action held for some steps.
 
     Attributes:
         cfg: nothing; rsl-rl asks for it.
     """
 
-    def __init__(self, environment: BatchedEnvironment[Any], encoding: str = "plain") -> None:
-        """`encoding` is a name in `policy.ENCODINGS`."""
+    def __init__(
+        self, environment: BatchedEnvironment[Any], encoding: str = "plain", repeat: int = 1
+    ) -> None:
+        """`encoding` is a name in `policy.ENCODINGS`; `repeat` the steps of an action."""
         mdp = environment.mdp
         self.environment = environment
+        self.repeat = repeat
         self._encode = ENCODINGS[encoding]
         self.num_envs = environment.count
         self.num_actions = mdp.action_size
@@ -43,13 +47,25 @@ class TorchEnvironment(VecEnv):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Extras: `time_outs`, whether an episode ended with its last step, shape (num_envs,)."""
-        transition = self.environment.step(actions.numpy().astype("float64"))
+        """`repeat` steps; the reward is the mean of theirs, so that values do not grow with
+        `repeat`. Of an episode that ends on the way the missing steps count as zero; the
+        one that begins waits for its first action with one of zeros. Extras: `time_outs`, whether
+        an episode ended with its last step, shape (num_envs,)."""
+        held = actions.numpy().astype("float64")
+        transition = self.environment.step(held)
+        reward = transition.reward
+        terminal, time_outs = transition.terminal, transition.truncated
+        for _ in range(self.repeat - 1):
+            over = terminal | time_outs
+            held[over] = 0.0
+            transition = self.environment.step(held)
+            reward = reward + np.where(over, 0.0, transition.reward)
+            terminal = terminal | (transition.terminal & ~over)
+            time_outs = time_outs | (transition.truncated & ~over)
         self._observation = self._tensors(transition.observation)
-        time_outs = torch.from_numpy(transition.truncated)
-        dones = torch.from_numpy(transition.terminal) | time_outs
-        rewards = torch.from_numpy(transition.reward).float()
-        return self._observation, rewards, dones.long(), {"time_outs": time_outs.float()}
+        rewards = torch.from_numpy(reward / self.repeat).float()
+        dones = torch.from_numpy(terminal | time_outs).long()
+        return self._observation, rewards, dones, {"time_outs": torch.from_numpy(time_outs).float()}
 
     def snapshot(self) -> dict[str, Any]:
         """The environment's, with the observation that the next action answers."""
