@@ -3,7 +3,9 @@
 On the same kind of machine with the same versions, a score repeats bit for bit. On another kind,
 numpy and BLAS choose other kernels, and a policy's output may differ in its last bits: the physics
 is then replayed from the actions that were kept, and the rest compared within the protocol's
-tolerance. With another mujoco, another model or another policy there is nothing to compare.
+tolerance. mujoco uses none of their kernels, but the reward of a state does: from AVX2 to AVX-512
+rewards were seen to differ by 4e-15 of themselves. With another mujoco, another model or another
+policy there is nothing to compare.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import fingerprint
 
 PACKAGES = ("mujoco", "numpy", "scipy", "tsbench")
+SAME_REWARD = 1e-12  # of itself, from kernel to kernel; another physics is farther off
 
 
 @dataclass(frozen=True)
@@ -115,7 +118,7 @@ def episode_starts(task: Task[Any], perturbed: Start) -> Start:
 
 
 def replay(task: Task[Any], starts: Start, log: ActionLog) -> bool:
-    """Whether the logged actions earn the logged rewards again, to the last bit.
+    """Whether the logged actions earn the logged rewards again, but for `SAME_REWARD`.
 
     Args:
         task: that the log is of.
@@ -130,7 +133,7 @@ def replay(task: Task[Any], starts: Start, log: ActionLog) -> bool:
     for actions, rewards in zip(log.actions, log.rewards, strict=True):
         following = physics.advance(state, actions)
         earned = np.where(going, task.reward(state, actions, following), 0.0)
-        if not np.array_equal(earned, rewards):
+        if not np.allclose(earned, rewards, rtol=SAME_REWARD, atol=0.0):
             return False
         going &= ~task.terminal(following)
         state = following
@@ -198,7 +201,7 @@ def compare(
     else:
         replayed = replay(task, starts, log)
         agrees &= replayed
-        words += "; physics replayed from the action log bit for bit: "
+        words += "; physics replayed from the action log: "
         words += "equal" if replayed else "DIFFERENT"
     return Comparison("tolerant", agrees, words)
 
