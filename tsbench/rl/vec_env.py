@@ -47,10 +47,10 @@ class TorchEnvironment(VecEnv):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """`repeat` steps; the reward is the mean of theirs, so that values do not grow with
-        `repeat`. Of an episode that ends on the way the missing steps count as zero; the
-        one that begins waits for its first action with one of zeros. Extras: `time_outs`, whether
-        an episode ended with its last step, shape (num_envs,)."""
+        """`repeat` steps; the reward is the mean of theirs, not the sum, which keeps values small.
+        Of an episode that ends on the way the missing steps count as zero; the one that begins
+        waits for its first action with one of zeros. Extras: `time_outs`, whether an episode ended
+        with its last step, shape (num_envs,)."""
         held = actions.numpy().astype("float64")
         transition = self.environment.step(held)
         reward = transition.reward
