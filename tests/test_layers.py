@@ -60,6 +60,7 @@ ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl"},
     "rsl_rl": {"rl"},
     "tensordict": {"rl"},
+    "threadpoolctl": {"rl"},
     "gymnasium": {"sim", "gym", "bench"},
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},

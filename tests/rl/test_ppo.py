@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rsl_rl.storage import RolloutStorage
-from tensordict import TensorDict
 
 from tsbench import TsbenchError, tasks
 from tsbench.errors import NotFiniteError
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS, Policy
 from tsbench.problem import Budget, Problem
-from tsbench.rl.ppo import Learner, PPOSettings, Storage
+from tsbench.rl.ppo import Learner, PPOSettings
 from tsbench.rl.stages import StageSettings, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment, Physics
@@ -76,32 +74,6 @@ def test_the_same_bits_under_a_seed(
     assert bits(first) == bits(second)
     assert bits(first) != bits(other)
     assert bits(first) != bits(trained(0, 3, subjects[kind]))
-
-
-def test_minibatches_are_those_of_rsl_rl() -> None:
-    observation = TensorDict({"policy": torch.zeros(3, 2)}, batch_size=[3])
-    ours, theirs = (
-        kind("rl", 3, 5, observation, [1], device="cpu") for kind in (Storage, RolloutStorage)
-    )
-    for name in ("actions", "values", "returns", "advantages", "actions_log_prob"):
-        values = torch.rand_like(getattr(theirs, name))
-        setattr(ours, name, values)
-        setattr(theirs, name, values)
-    steps = torch.rand(5, 3, 2)
-    for storage in (ours, theirs):
-        storage.observations["policy"].copy_(steps)
-        storage.distribution_params = (steps, steps + 1.0)
-    batches = []
-    for storage in (ours, theirs):
-        torch.manual_seed(1)
-        batches.append(list(storage.mini_batch_generator(4, 3)))
-    assert len(batches[0]) == len(batches[1]) == 12
-    for mine, wanted in zip(*batches, strict=True):
-        assert torch.equal(mine.observations["policy"], wanted.observations["policy"])
-        for name in ("actions", "values", "returns", "advantages", "old_actions_log_prob"):
-            assert torch.equal(getattr(mine, name), getattr(wanted, name))
-        pairs = zip(mine.old_distribution_params, wanted.old_distribution_params, strict=True)
-        assert all(torch.equal(a, b) for a, b in pairs)
 
 
 def test_steps_are_counted() -> None:

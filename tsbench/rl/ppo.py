@@ -1,7 +1,8 @@
 """Proximal policy optimisation by rsl-rl, and the artefact it leaves behind.
 
-rsl-rl's `PPO`, models and storage do the learning. Its runner is not used: it prints a page per
-iteration, stores the enclosing repository's diff and changes the configuration it is given.
+rsl-rl's `PPO`, models and storage do the learning, but for the update (`rl/update.py`). Its runner
+is not used: it prints a page per iteration, stores the enclosing repository's diff and changes the
+configuration it is given.
 """
 
 from __future__ import annotations
@@ -9,19 +10,19 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
 from tsbench.errors import NotFiniteError, TsbenchError
 from tsbench.mdp import Task
 from tsbench.policy import ACTIVATIONS, ENCODINGS, Policy, PolicyInfo
+from tsbench.rl.update import LeanPPO
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.model import fingerprint
@@ -120,18 +121,6 @@ class PPOSettings:
         return self.environments * self.rollout * self.repeat
 
 
-class Storage(RolloutStorage):
-    """rsl-rl's storage, its minibatches made once: it does not shuffle again from epoch to epoch,
-    and to index the same steps anew is a twentieth of the rocket's update."""
-
-    def mini_batch_generator(
-        self, num_mini_batches: int, num_epochs: int = 8
-    ) -> Iterator[RolloutStorage.Batch]:
-        batches = list(super().mini_batch_generator(num_mini_batches, 1))
-        for _ in range(num_epochs):
-            yield from batches
-
-
 class Learner:
     """An actor and a critic that learn in one environment.
 
@@ -166,7 +155,7 @@ class Learner:
             with torch.no_grad():
                 self._ppo.actor.distribution.std_param.fill_(settings.initial_std)
 
-    def _build(self) -> PPO:
+    def _build(self) -> LeanPPO:
         s, env = self.settings, self._env
         observation = env.get_observations()
         groups = {"actor": ["policy"], "critic": ["value"]}
@@ -181,11 +170,12 @@ class Learner:
             actor.mlp[-1].weight.mul_(0.01)
             actor.mlp[-1].bias.zero_()
         critic = MLPModel(observation, groups, "critic", 1, **shared)
-        storage = Storage("rl", env.num_envs, s.rollout, observation, [env.num_actions])
-        return PPO(
+        storage = RolloutStorage("rl", env.num_envs, s.rollout, observation, [env.num_actions])
+        return LeanPPO(
             actor,
             critic,
             storage,
+            activation=s.activation,
             num_learning_epochs=s.epochs,
             num_mini_batches=s.minibatches,
             clip_param=s.clip,
@@ -241,11 +231,7 @@ class Learner:
                 report(self.steps, metrics)
 
     def _update(self) -> dict[str, float]:
-        try:
-            losses = self._ppo.update()
-        except RuntimeError:  # torch cannot draw actions, perhaps from what has blown up
-            self._expect_sound()
-            raise
+        losses = self._ppo.update()
         self._expect_finite(losses)
         self._expect_sound()
         return losses
@@ -284,8 +270,6 @@ class Learner:
         if s.final_learning_rate is not None:
             rate = s.learning_rate * (s.final_learning_rate / s.learning_rate) ** share
             self._ppo.learning_rate = rate
-            for group in self._ppo.optimizer.param_groups:
-                group["lr"] = rate
 
     def _count(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
         repeat = self.settings.repeat  # an episode's last hold counts in full
@@ -304,10 +288,7 @@ class Learner:
             "steps": self.steps,
             "actor": _arrays(ppo.actor.state_dict()),
             "critic": _arrays(ppo.critic.state_dict()),
-            "optimizer": {
-                str(index): _arrays(moments)
-                for index, moments in ppo.optimizer.state_dict()["state"].items()
-            },
+            "optimizer": {"policy": ppo.policy.snapshot(), "value": ppo.value.snapshot()},
             "learning_rate": ppo.learning_rate,
             "rng": torch.get_rng_state().numpy(),
             "environment": self._env.snapshot(),
@@ -330,11 +311,8 @@ class Learner:
             self.steps = snapshot["steps"]
             ppo.actor.load_state_dict(_tensors(snapshot["actor"]))
             ppo.critic.load_state_dict(_tensors(snapshot["critic"]))
-            groups = ppo.optimizer.state_dict()["param_groups"]
-            for group in groups:
-                group["lr"] = snapshot["learning_rate"]
-            moments = {int(i): _tensors(state) for i, state in snapshot["optimizer"].items()}
-            ppo.optimizer.load_state_dict({"state": moments, "param_groups": groups})
+            ppo.policy.restore(snapshot["optimizer"]["policy"])
+            ppo.value.restore(snapshot["optimizer"]["value"])
             ppo.learning_rate = snapshot["learning_rate"]
             torch.set_rng_state(torch.from_numpy(snapshot["rng"]))
             self._env.restore(snapshot["environment"])

@@ -1,0 +1,263 @@
+"""PPO's update of small networks, without a framework's overhead.
+
+rsl-rl's update of a network of 64 x 64 units by 256 actions takes torch five times as long as its
+arithmetic does: some 250 small operations, each dispatched, recorded and differentiated. Here the
+same update (tests/rl/test_update.py holds the two against each other) has its gradients written
+out in numpy, on the memory of torch's parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.algorithms import PPO
+from torch import nn
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8  # of Adam (Kingma and Ba 2015), as torch's defaults
+KL_RATES = (1e-5, 1e-2)  # that rsl-rl's adaptive learning rate stays between
+KL_FACTOR = 1.5  # by which that changes it
+
+Array = np.ndarray  # float32, as torch's
+
+
+def _elu(x: Array, out: Array) -> None:
+    """In place; `out` is scratch."""
+    np.exp(np.minimum(x, 0.0, out=out), out=out)
+    out -= 1.0
+    np.maximum(x, out, out=x)
+
+
+def _elu_slope(y: Array, out: Array) -> None:
+    np.minimum(y, 0.0, out=out)
+    out += 1.0
+
+
+def _relu(x: Array, out: Array) -> None:
+    np.maximum(x, 0.0, out=x)
+
+
+def _relu_slope(y: Array, out: Array) -> None:
+    np.greater(y, 0.0, out=out, casting="unsafe")
+
+
+def _tanh(x: Array, out: Array) -> None:
+    np.tanh(x, out=x)
+
+
+def _tanh_slope(y: Array, out: Array) -> None:
+    np.multiply(y, y, out=out)
+    np.subtract(1.0, out, out=out)
+
+
+# What each of `policy.ACTIVATIONS` does to an array, in place, and its slope, from what it made.
+_ACTIVATIONS: dict[str, tuple[Callable[[Array, Array], None], Callable[[Array, Array], None]]] = {
+    "elu": (_elu, _elu_slope),
+    "relu": (_relu, _relu_slope),
+    "tanh": (_tanh, _tanh_slope),
+}
+
+
+class Network:
+    """A multilayer perceptron that lives in torch, its parameters and gradients in one vector each.
+
+    Attributes:
+        spread: view of the parameter that belongs to no layer, the standard deviation of the
+            actions; empty without one. `spread_gradient` is its gradient, for the caller to fill.
+    """
+
+    def __init__(self, model: nn.Module, activation: str, most: float) -> None:
+        """`most` is the norm that gradients are clipped to."""
+        parameters = list(model.parameters())
+        self._values = np.concatenate([p.detach().numpy().ravel() for p in parameters])
+        self._gradient = np.zeros_like(self._values)
+        self._moments = (np.zeros_like(self._values), np.zeros_like(self._values))
+        self._updates = 0
+        self._most = most
+        self._activate, self._slope = _ACTIVATIONS[activation]
+        layers = [layer for layer in model.modules() if isinstance(layer, nn.Linear)]
+        inside = {id(p) for layer in layers for p in layer.parameters()}
+        views: dict[int, tuple[Array, Array]] = {}
+        self.spread = self.spread_gradient = self._values[:0]
+        start = 0
+        for p in parameters:
+            part = slice(start, start := start + p.numel())
+            value, gradient = (a[part].reshape(p.shape) for a in (self._values, self._gradient))
+            p.data = torch.from_numpy(value)
+            views[id(p)] = value, gradient
+            if id(p) not in inside:
+                self.spread, self.spread_gradient = value, gradient
+        self._layers = [(*views[id(la.weight)], *views[id(la.bias)]) for la in layers]
+        self._outputs: list[Array] = []  # of each layer, activated
+        self._deltas: list[Array] = []  # the loss's gradients by those, before activation
+        self._scratch: list[Array] = []
+
+    def forward(self, x: Array) -> Array:
+        """Shape (batch, inputs) -> (batch, outputs), in memory that the next call writes to."""
+        if not self._outputs or len(self._outputs[0]) != len(x):
+            shapes = [(len(x), len(weight)) for weight, *_ in self._layers]
+            self._outputs, self._deltas, self._scratch = (
+                [np.empty(shape, np.float32) for shape in shapes] for _ in range(3)
+            )
+        self._input = x
+        for i, (weight, _, bias, _) in enumerate(self._layers):
+            y = self._outputs[i]
+            np.matmul(x, weight.T, out=y)
+            y += bias
+            if i < len(self._layers) - 1:
+                self._activate(y, self._scratch[i])
+            x = y
+        return x
+
+    def backward(self, delta: Array) -> None:
+        """Gradients of a loss from those by the outputs of the last `forward`, same shape."""
+        for i in range(len(self._layers) - 1, -1, -1):
+            weight, weight_gradient, _, bias_gradient = self._layers[i]
+            x = self._outputs[i - 1] if i else self._input
+            np.matmul(delta.T, x, out=weight_gradient)
+            np.sum(delta, axis=0, out=bias_gradient)
+            if i:
+                before, slope = self._deltas[i - 1], self._scratch[i - 1]
+                np.matmul(delta, weight, out=before)
+                self._slope(x, slope)
+                before *= slope
+                delta = before
+
+    def step(self, rate: float) -> None:
+        """One of Adam, along the clipped gradient."""
+        gradient, (first, second) = self._gradient, self._moments
+        norm = math.sqrt(float(gradient @ gradient))
+        gradient *= min(self._most / (norm + 1e-6), 1.0)
+        self._updates += 1
+        first += (1.0 - BETA1) * (gradient - first)
+        second *= BETA2
+        gradient *= gradient
+        second += (1.0 - BETA2) * gradient
+        scale = rate / (1.0 - BETA1**self._updates)
+        root = np.sqrt(second)
+        root *= 1.0 / math.sqrt(1.0 - BETA2**self._updates)
+        root += EPSILON
+        np.divide(first, root, out=root)
+        root *= scale
+        self._values -= root
+
+    def snapshot(self) -> dict[str, Any]:
+        """Of Adam; the parameters are torch's to save."""
+        first, second = self._moments
+        return {"updates": self._updates, "first": first, "second": second}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        self._updates = int(snapshot["updates"])
+        for moment, name in zip(self._moments, ("first", "second"), strict=True):
+            moment[:] = snapshot[name]
+
+
+class LeanPPO(PPO):
+    """rsl-rl's PPO with a Gaussian policy, of one spread for all states, and its own update.
+
+    Attributes:
+        learning_rate: of both networks, in the next update.
+        policy: the actor's parameters.
+        value: the critic's.
+    """
+
+    learning_rate: float
+    desired_kl: float | None
+
+    def __init__(self, *arguments: Any, activation: str, **settings: Any) -> None:
+        """`activation` is a name in `policy.ACTIVATIONS`, the rest rsl-rl's."""
+        super().__init__(*arguments, **settings)
+        self.policy = Network(self.actor, activation, self.max_grad_norm)
+        self.value = Network(self.critic, activation, self.max_grad_norm)
+
+    def update(self) -> dict[str, float]:
+        """Epochs over minibatches of the stored steps, shuffled once, as rsl-rl does. Returns the
+        mean losses."""
+        storage = self.storage
+        size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
+        order = torch.randperm(size * self.num_mini_batches)
+        observation = storage.observations.flatten(0, 1)
+
+        def split(steps: torch.Tensor) -> list[Array]:
+            shuffled = steps[order].numpy()
+            return [shuffled[i : i + size] for i in range(0, len(shuffled), size)]
+
+        with torch.no_grad():
+            seen = split(self.actor.get_latent(observation))
+            valued = split(self.critic.get_latent(observation))
+            mean, spread = (split(p.flatten(0, 1)) for p in storage.distribution_params)
+        actions, log_prob, advantage, returns, values = (
+            split(steps.flatten(0, 1))
+            for steps in (
+                storage.actions, storage.actions_log_prob, storage.advantages, storage.returns,
+                storage.values,
+            )
+        )  # fmt: skip
+        losses = np.zeros(2)
+        with np.errstate(all="ignore"):  # the learner looks at what comes out
+            for _ in range(self.num_learning_epochs):
+                for i in range(self.num_mini_batches):
+                    losses += (
+                        self._update_policy(
+                            seen[i], actions[i], log_prob[i], advantage[i], mean[i], spread[i]
+                        ),
+                        self._update_value(valued[i], returns[i], values[i]),
+                    )
+        self.actor.update_normalization(observation)
+        self.critic.update_normalization(observation)
+        storage.clear()
+        surrogate, value = losses / (self.num_learning_epochs * self.num_mini_batches)
+        return {"value": float(value), "surrogate": float(surrogate)}
+
+    def _update_policy(
+        self, seen: Array, actions: Array, log_prob: Array, advantage: Array, mean: Array,
+        spread: Array,
+    ) -> float:  # fmt: skip
+        """The clipped surrogate and the entropy bonus (Schulman et al. 2017, eq. 7 and 9); sets
+        the learning rate where that is adapted. Arrays are (batch, ...) and what was when the
+        actions were taken."""
+        now = self.policy.forward(seen)
+        std = self.policy.spread
+        if self.desired_kl is not None and self.schedule == "adaptive":
+            self._adapt(self.desired_kl, mean, spread, now, std)
+        z = (actions - now) / std
+        constant = 0.5 * math.log(2.0 * math.pi) * std.size
+        new = -0.5 * np.sum(z * z, axis=1, keepdims=True) - (np.sum(np.log(std)) + constant)
+        ratio = np.exp(new - log_prob)
+        low, high = 1.0 - self.clip_param, 1.0 + self.clip_param
+        gain = advantage * ratio
+        clipped = advantage * np.clip(ratio, low, high)
+        # Where clipping makes the gain smaller it does not depend on the policy any more.
+        by_log_prob = np.where(clipped < gain, np.float32(0.0), gain) * np.float32(-1.0 / len(gain))
+        self.policy.backward(by_log_prob * z / std)
+        by_std = by_log_prob * (z * z - 1.0)
+        self.policy.spread_gradient[:] = (np.sum(by_std, axis=0) - self.entropy_coef) / std
+        self.policy.step(self.learning_rate)
+        return -float(np.mean(np.minimum(gain, clipped)))
+
+    def _adapt(self, wanted: float, mean: Array, spread: Array, now: Array, std: Array) -> None:
+        """The learning rate, to a mean divergence of the policy from the one that acted."""
+        divergence = np.log(std / spread) - 0.5
+        divergence += (spread**2 + (mean - now) ** 2) / (2.0 * std**2)
+        kl = float(np.mean(np.sum(divergence, axis=1)))
+        if kl > 2.0 * wanted:
+            self.learning_rate = max(KL_RATES[0], self.learning_rate / KL_FACTOR)
+        elif 0.0 < kl < 0.5 * wanted:
+            self.learning_rate = min(KL_RATES[1], self.learning_rate * KL_FACTOR)
+
+    def _update_value(self, seen: Array, returns: Array, values: Array) -> float:
+        now = self.value.forward(seen)
+        error = now - returns
+        square = error * error
+        if self.use_clipped_value_loss:
+            change = now - values
+            bounded = values + np.clip(change, -self.clip_param, self.clip_param) - returns
+            worse = bounded * bounded
+            error = np.where(worse > square, np.float32(0.0), error)
+            square = np.maximum(square, worse)
+        self.value.backward(error * np.float32(2.0 * self.value_loss_coef / len(error)))
+        self.value.step(self.learning_rate)
+        return float(np.mean(square))
