@@ -106,7 +106,7 @@ def test_rate_and_spread_fall_over_a_stage() -> None:
     taught.learn(512, lambda _, metrics: reports.append(metrics))
     rates = [metrics["learning_rate"] for metrics in reports]
     np.testing.assert_allclose(rates, 1e-3 * 10.0 ** (-0.5 * np.arange(1, 5)))
-    assert 0.0 < taught._ppo.actor.distribution.std_param.max().item() <= 0.05 + 1e-6
+    assert taught._ppo.actor.distribution.log_std_param.max().exp().item() <= 0.05 + 1e-6
 
 
 def test_weights_that_blow_up_are_noticed_at_once() -> None:

@@ -31,7 +31,7 @@ def filled(kind: type[PPO], seed: int = 0, **settings: Any) -> PPO:
     }  # fmt: skip
     actor = MLPModel(
         observation, groups, "actor", ACTIONS, **shared,
-        distribution_cfg={"class_name": "GaussianDistribution", "init_std": 0.7},
+        distribution_cfg={"class_name": "GaussianDistribution", "init_std": 0.7, "std_type": "log"},
     )  # fmt: skip
     critic = MLPModel(observation, groups, "critic", 1, **shared)
     storage = RolloutStorage("rl", ENVIRONMENTS, STEPS, observation, [ACTIONS])
@@ -74,7 +74,7 @@ def weights(ppo: PPO) -> dict[str, np.ndarray]:
         {"use_clipped_value_loss": True, "clip_param": 0.05, "learning_rate": 1e-2},
         {"clip_param": 0.02, "learning_rate": 1e-2},
         {"schedule": "adaptive", "desired_kl": 0.01},
-        {"schedule": "adaptive", "desired_kl": 1e-4},
+        {"schedule": "adaptive", "desired_kl": 1e-3},
         {"schedule": "adaptive", "desired_kl": 10.0},
         {"num_mini_batches": 7},  # which leaves steps over
     ],

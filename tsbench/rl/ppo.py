@@ -153,7 +153,7 @@ class Learner:
                 actor_from._ppo.critic.obs_normalizer.state_dict()
             )
             with torch.no_grad():
-                self._ppo.actor.distribution.std_param.fill_(settings.initial_std)
+                self._ppo.actor.distribution.log_std_param.fill_(math.log(settings.initial_std))
 
     def _build(self) -> LeanPPO:
         s, env = self.settings, self._env
@@ -164,7 +164,11 @@ class Learner:
         }  # fmt: skip
         actor = MLPModel(
             observation, groups, "actor", env.num_actions, **shared,
-            distribution_cfg={"class_name": "GaussianDistribution", "init_std": s.initial_std},
+            # Of its logarithm's steps none is large when the spread is small: learned as it is, it
+            # collapses within some updates of a seed that has not found out yet what pays.
+            distribution_cfg={
+                "class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log",
+            },
         )  # fmt: skip
         with torch.no_grad():  # at first every mean action is nearly zero: the nominal pose
             actor.mlp[-1].weight.mul_(0.01)
@@ -250,14 +254,14 @@ class Learner:
         """The losses are those before the last update; what it left is looked at too."""
         networks = {"actor": self._ppo.actor, "critic": self._ppo.critic}
         finite = all(w.isfinite().all() for n in networks.values() for w in n.parameters())
-        if not (finite and self._ppo.actor.distribution.std_param.min() > 0.0):
+        if not finite:
             arrays = {
                 f"{network}.{name}": tensor.numpy()
                 for network, model in networks.items()
                 for name, tensor in model.state_dict().items()
             }
-            message = "a weight is not finite, or the spread not positive, in the iteration after "
-            raise NotFiniteError(f"{message}{self.steps} steps", arrays)
+            message = f"a weight is not finite in the iteration after {self.steps} steps"
+            raise NotFiniteError(message, arrays)
 
     def _settle(self, share: float) -> None:
         """Holds the policy's spread below its bound, and lowers the learning rate, after a share
@@ -266,7 +270,7 @@ class Learner:
         if s.final_std is not None:
             bound = s.initial_std * (s.final_std / s.initial_std) ** share
             with torch.no_grad():
-                self._ppo.actor.distribution.std_param.clamp_(max=bound)
+                self._ppo.actor.distribution.log_std_param.clamp_(max=math.log(bound))
         if s.final_learning_rate is not None:
             rate = s.learning_rate * (s.final_learning_rate / s.learning_rate) ** share
             self._ppo.learning_rate = rate

@@ -20,6 +20,7 @@ from torch import nn
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8  # of Adam (Kingma and Ba 2015), as torch's defaults
 KL_RATES = (1e-5, 1e-2)  # that rsl-rl's adaptive learning rate stays between
 KL_FACTOR = 1.5  # by which that changes it
+KL_ROUNDING = 1e-12  # more than the divergence of a policy from itself, which says nothing about it
 
 Array = np.ndarray  # float32, as torch's
 
@@ -65,8 +66,9 @@ class Network:
     """A multilayer perceptron that lives in torch, its parameters and gradients in one vector each.
 
     Attributes:
-        spread: view of the parameter that belongs to no layer, the standard deviation of the
-            actions; empty without one. `spread_gradient` is its gradient, for the caller to fill.
+        log_std: view of the parameter that belongs to no layer, the logarithm of the actions'
+            standard deviation; empty without one.
+        log_std_gradient: for the caller to fill.
     """
 
     def __init__(self, model: nn.Module, activation: str, most: float) -> None:
@@ -81,7 +83,7 @@ class Network:
         layers = [layer for layer in model.modules() if isinstance(layer, nn.Linear)]
         inside = {id(p) for layer in layers for p in layer.parameters()}
         views: dict[int, tuple[Array, Array]] = {}
-        self.spread = self.spread_gradient = self._values[:0]
+        self.log_std = self.log_std_gradient = self._values[:0]
         start = 0
         for p in parameters:
             part = slice(start, start := start + p.numel())
@@ -89,7 +91,7 @@ class Network:
             p.data = torch.from_numpy(value)
             views[id(p)] = value, gradient
             if id(p) not in inside:
-                self.spread, self.spread_gradient = value, gradient
+                self.log_std, self.log_std_gradient = value, gradient
         self._layers = [(*views[id(la.weight)], *views[id(la.bias)]) for la in layers]
         self._outputs: list[Array] = []  # of each layer, activated
         self._deltas: list[Array] = []  # the loss's gradients by those, before activation
@@ -220,12 +222,13 @@ class LeanPPO(PPO):
         the learning rate where that is adapted. Arrays are (batch, ...) and what was when the
         actions were taken."""
         now = self.policy.forward(seen)
-        std = self.policy.spread
+        log_std = self.policy.log_std
+        std = np.exp(log_std)
         if self.desired_kl is not None and self.schedule == "adaptive":
             self._adapt(self.desired_kl, mean, spread, now, std)
         z = (actions - now) / std
-        constant = 0.5 * math.log(2.0 * math.pi) * std.size
-        new = -0.5 * np.sum(z * z, axis=1, keepdims=True) - (np.sum(np.log(std)) + constant)
+        constant = 0.5 * math.log(2.0 * math.pi) * log_std.size
+        new = -0.5 * np.sum(z * z, axis=1, keepdims=True) - (np.sum(log_std) + constant)
         ratio = np.exp(new - log_prob)
         low, high = 1.0 - self.clip_param, 1.0 + self.clip_param
         gain = advantage * ratio
@@ -233,19 +236,19 @@ class LeanPPO(PPO):
         # Where clipping makes the gain smaller it does not depend on the policy any more.
         by_log_prob = np.where(clipped < gain, np.float32(0.0), gain) * np.float32(-1.0 / len(gain))
         self.policy.backward(by_log_prob * z / std)
-        by_std = by_log_prob * (z * z - 1.0)
-        self.policy.spread_gradient[:] = (np.sum(by_std, axis=0) - self.entropy_coef) / std
+        by_log_std = by_log_prob * (z * z - 1.0)
+        np.sum(by_log_std, axis=0, out=self.policy.log_std_gradient)
+        self.policy.log_std_gradient -= self.entropy_coef
         self.policy.step(self.learning_rate)
         return -float(np.mean(np.minimum(gain, clipped)))
 
     def _adapt(self, wanted: float, mean: Array, spread: Array, now: Array, std: Array) -> None:
         """The learning rate, to a mean divergence of the policy from the one that acted."""
-        divergence = np.log(std / spread) - 0.5
-        divergence += (spread**2 + (mean - now) ** 2) / (2.0 * std**2)
-        kl = float(np.mean(np.sum(divergence, axis=1)))
+        ratio, distance = (spread.astype(float) / std) ** 2, ((mean - now) / std) ** 2
+        kl = 0.5 * float(np.mean(np.sum(ratio - 1.0 - np.log(ratio) + distance, axis=1)))
         if kl > 2.0 * wanted:
             self.learning_rate = max(KL_RATES[0], self.learning_rate / KL_FACTOR)
-        elif 0.0 < kl < 0.5 * wanted:
+        elif KL_ROUNDING < kl < 0.5 * wanted:
             self.learning_rate = min(KL_RATES[1], self.learning_rate * KL_FACTOR)
 
     def _update_value(self, seen: Array, returns: Array, values: Array) -> float:
