@@ -51,7 +51,7 @@ PLAN_TURN = 0.05  # rad per plan step (P prints degrees; D: see spec section 1)
 # Of the imitation reward; no score depends on them.
 TRACKING_DECAY = -0.625  # k_imi (P)
 TRACKING_PENALTY = 0.25  # of a collision (P)
-TRACKING_ARRIVAL = 4.0  # m, over which arriving is felt (D)
+TRACKING_ARRIVAL = 1.0  # m, over which arriving is felt (C)
 TRACKING_ADVANCE = 1.0  # per metre that a step brings along the reference (C)
 # m a step (C): going faster than 10 m/s, twice the plan's speed, earns no more: such rockets
 # tumble when they brake. Going back costs what it costs: no rocket does 25 m/s.
@@ -392,12 +392,13 @@ class Rocket(Task[RocketState]):
 
         `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
         `progress` (default): the same with the sparse R replaced by
-        0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 4 m), where s of the path's length L lies before
+        0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 1 m), where s of the path's length L lies before
         xbar, and 1 for each metre by which the step raised s, up to 0.2 m (D). The printed form is
         itself sparse when the goal is far. Without the exponential the last metres are worth about
         1 % each, less than what leaving a steady hover costs, and without the pay for advancing
-        the same holds on the way: policies stop some metres short, or are slow. With pay for any
-        speed they come in too fast to stop (docs/calibration.md). Going forth gains at most what
+        the same holds on the way: policies stop some metres short, or are slow. Felt over 4 m,
+        arriving is not worth the last metre. With pay for any speed they come in too fast to stop
+        (docs/calibration.md). Going forth gains at most what
         going back has lost: to and fro does not pay.
         """
         form = self.imitation_form(form)
