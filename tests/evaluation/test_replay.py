@@ -18,6 +18,7 @@ from tsbench.evaluation.replay import (
     Comparison,
     compare,
     constants_hash,
+    differences,
     episode_starts,
     machine,
     replay,
@@ -154,6 +155,15 @@ def test_another_kind_of_machine(
 
     found = compared(kept, score, starts, None)
     assert "no action log" in found.words
+
+
+def test_a_difference_of_just_the_tolerance(score: Score) -> None:
+    """One episode of twenty: 0.55 - 0.5 is 0.05 and a little."""
+    there, here = (json.loads(json.dumps(score.as_dict())) for _ in range(2))
+    there["perturbed"]["violations"], here["perturbed"]["violations"] = 0.5, 0.55
+    assert differences(there, here, PROTOCOL) == []
+    here["perturbed"]["violations"] = 0.5501
+    assert differences(there, here, PROTOCOL) == ["perturbed.violations 0.5 there, 0.5501 here"]
 
 
 def test_replay_finds_any_change(score: Score, starts: Start) -> None:
