@@ -20,6 +20,7 @@ from tsbench.rl.ppo import Learner, PPOSettings
 from tsbench.rl.stages import StageSettings, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.disturbed import Disturbances
 from tsbench.sim.episodes import play
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
@@ -272,6 +273,19 @@ def test_settings() -> None:
     # The last stage goes on with the imitation's network.
     both = problem(imitate={"hidden": [8], "entropy": 0.1}, finetune={"entropy": 0.2})
     assert settings(both, "finetune") == StageSettings(hidden=(8,), entropy=0.2)
+
+
+def test_finetuning_is_pushed_as_hard_as_the_imitation_was_in_the_end() -> None:
+    pushed = {"disturb": {"push": 300.0, "rise": 10_000, "calm": 0.2}}
+    assert settings(problem(imitate=pushed), "imitate").disturb == Disturbances(300.0, 10_000, 0.2)
+    assert settings(problem(imitate=pushed), "finetune").disturb == Disturbances(300.0, 0, 0.2)
+    changed = problem(imitate=pushed, finetune={"disturb": {"calm": 0.5, "mass": 0.1}})
+    assert settings(changed, "finetune").disturb == Disturbances(300.0, 0, 0.5, mass=0.1)
+    again = problem(imitate=pushed, finetune={"disturb": {"rise": 5_000}})
+    assert settings(again, "finetune").disturb.rise == 5_000
+    longer = problem(imitate=pushed, finetune={"disturb": {"duration": 1.5}})
+    with pytest.raises(TsbenchError, match=r"training\.finetune\.disturb\.duration .* interval"):
+        settings(longer, "finetune")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tsbench.errors import TsbenchError, unknown
@@ -28,30 +28,44 @@ class StageSettings(PPOSettings):
 
 
 def settings(problem: Problem, kind: str) -> StageSettings:
-    """The settings of a kind of stage. Those of `finetune`, which goes on with the imitation
-    stage's policy, are changes to those of `imitate`.
+    """The settings of a kind of stage.
 
     Raises:
         TsbenchError: unknown names or values of the wrong type or range.
     """
     if kind not in KINDS:
         raise unknown("kind of stage", f"task.training.{kind}", KINDS)
-    changes: dict[str, Any] = {}
-    for name in ("imitate", "finetune") if kind == "finetune" else (kind,):
-        given = problem.training.get(name, {})
-        changes |= typed_items(StageSettings, given, f"task.training.{name}")
+    changes = _changes(problem, kind)
     if (most := problem.budget.environments) is not None:
         changes["environments"] = min(changes.get("environments", most), most)
-    if kind == "plan" and changes.get("disturb", Disturbances()) != Disturbances():
+    disturb = changes.get("disturb", Disturbances())
+    if kind == "plan" and disturb != Disturbances():
         raise TsbenchError("task.training.plan.disturb: planning has no physics to disturb")
-    disturb = changes.get("disturb")
-    if disturb is not None and disturb.interval < problem.task.timestep:
+    if disturb.interval < problem.task.timestep:
         step = f"a control step of {problem.task.timestep:.3g} s"
         raise TsbenchError(f"task.training.{kind}.disturb.interval must be at least {step}")
     try:
         return StageSettings(**changes)
     except ValueError as error:
         raise TsbenchError(f"task.training.{kind}.{error}") from None
+
+
+def _changes(problem: Problem, kind: str) -> dict[str, Any]:
+    """What differs from the defaults. `finetune` goes on with the imitation stage's policy, so its
+    settings are changes to those of `imitate`, and pushes that have risen there stay at their
+    bound."""
+    given, path = problem.training.get(kind, {}), f"task.training.{kind}"
+    changes = typed_items(StageSettings, given, path)
+    if kind != "finetune":
+        return changes
+    before = _changes(problem, "imitate")
+    other = typed_items(Disturbances, given.get("disturb", {}), f"{path}.disturb")
+    disturb: Disturbances = before.get("disturb", Disturbances())
+    try:
+        disturb = replace(disturb, **{"rise": 0, **other})
+    except ValueError as error:
+        raise TsbenchError(f"{path}.disturb.{error}") from None
+    return {**before, **changes, "disturb": disturb}
 
 
 def learn_planning(
