@@ -104,7 +104,15 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     kind, name = ONNX_TYPES[fitting[0].type], fitting[0].name
 
     def answer(observation: np.ndarray) -> Any:
-        return session.run(None, {name: observation[None].astype(kind)})[0][0]
+        try:
+            first = session.run(None, {name: observation[None].astype(kind)})[0]
+        except Exception as error:  # as above
+            raise TsbenchError(f"{path} cannot be run: {_line(error)}") from None
+        if np.ndim(first) != 2 or len(first) != 1:
+            raise TsbenchError(
+                f"{path} returns shape {np.shape(first)}, not (1, {mdp.action_size})"
+            )
+        return first[0]
 
     return ForeignPolicy(
         answer, mdp.observation_size, mdp.action_size, hashlib.sha256(content).hexdigest()
