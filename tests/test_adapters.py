@@ -23,18 +23,27 @@ WEIGHT = RNG.normal(size=(10, 2)).astype(np.float32)
 OBSERVATIONS = RNG.normal(size=(7, 10))
 
 
-def write_onnx(path: Path, inputs: int = 10, rows: Any = "n") -> Path:
-    """tanh(x W)."""
+def write_onnx(
+    path: Path, inputs: int = 10, rows: Any = "n", shape: tuple[int, ...] | None = None
+) -> Path:
+    """tanh(x W), made to have another shape if asked."""
     weight = RNG.normal(size=(inputs, 2)).astype(np.float32) if inputs != 10 else WEIGHT
+    nodes = [
+        helper.make_node("MatMul", ["x", "w"], ["h"]),
+        helper.make_node("Tanh", ["h"], ["y"]),
+    ]
+    initial = [numpy_helper.from_array(weight, "w")]
+    last, sizes = "y", [rows, 2]
+    if shape is not None:
+        last, sizes = "z", list(shape)
+        nodes.append(helper.make_node("Reshape", ["y", "s"], [last]))
+        initial.append(numpy_helper.from_array(np.array(shape, np.int64), "s"))
     graph = helper.make_graph(
-        [
-            helper.make_node("MatMul", ["x", "w"], ["h"]),
-            helper.make_node("Tanh", ["h"], ["y"]),
-        ],
+        nodes,
         "policy",
         [helper.make_tensor_value_info("x", TensorProto.FLOAT, [rows, inputs])],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, [rows, 2])],
-        [numpy_helper.from_array(weight, "w")],
+        [helper.make_tensor_value_info(last, TensorProto.FLOAT, sizes)],
+        initial,
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
     model.ir_version = 8
@@ -105,6 +114,7 @@ def test_evaluate_takes_a_function() -> None:
         tsbench.evaluate(lambda _: [0.0, 0.0], "rocket_navigation", protocol="v2")
     with pytest.raises(TsbenchError, match="no policy nowhere"):
         tsbench.evaluate("nowhere", "rocket_navigation")
+    assert tsbench.evaluate("zero", "rocket_navigation", protocol="smoke", threads=1) == score
 
 
 def test_evaluate_takes_a_model_that_is_there(baseline: tuple[Path, PPO]) -> None:
@@ -139,6 +149,15 @@ def test_onnx_files_that_do_not_fit(tmp_path: Path) -> None:
     (tmp_path / "q.txt").write_bytes(b"nonsense")
     with pytest.raises(TsbenchError, match=r"neither a run directory nor an \.onnx or \.zip"):
         adapters.load(tmp_path / "q.txt", TASK)
+
+
+def test_onnx_files_whose_answers_do_not_fit(tmp_path: Path) -> None:
+    flat = adapters.load(write_onnx(tmp_path / "flat.onnx", shape=(2,)), TASK)
+    with pytest.raises(TsbenchError, match=r"flat\.onnx returns shape \(2,\), not \(1, 2\)"):
+        flat(OBSERVATIONS)
+    broken = adapters.load(write_onnx(tmp_path / "broken.onnx", shape=(1, 3)), TASK)
+    with pytest.raises(TsbenchError, match=r"broken\.onnx cannot be run: "):
+        broken(OBSERVATIONS)
 
 
 def test_stable_baselines3(baseline: tuple[Path, PPO]) -> None:
@@ -181,7 +200,9 @@ def test_the_command_line(
     path = str(write_onnx(tmp_path / "p.onnx"))
     words = ["evaluate", path, "task=rocket_navigation", "--protocol", "smoke"]
     assert cli.main(words) == 0
-    assert "protocol smoke" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "protocol smoke" in shown
+    assert "not to be ranked: protocol smoke asks too little" in shown
     for wrong, message in (
         ([path], "task=NAME is missing; allowed: laikago_trot"),
         ([path, "task=rocket"], "unknown task 'rocket'"),

@@ -70,6 +70,7 @@ def intact(
     tmp_path_factory: pytest.TempPathFactory,
     naive_plan: Callable[[str], Plan],
     naive_reference: Callable[[str], ReferenceMotion],
+    invented_record: Callable[[str], record.Record],
 ) -> Path:
     """A run directory with something of everything in it. Not to be changed."""
     folder = tmp_path_factory.mktemp("intact")
@@ -88,26 +89,7 @@ def intact(
     ).save(folder)
     chosen = config.compose([f"task={NAME}", "budget=smoke"])
     (folder / "config.yaml").write_text(yaml.safe_dump(asdict(chosen)))
-    score = {
-        "normalized_reward": 0.5,
-        "optimality": 0.5,
-        "success": 1.0,
-        "perturbed": {"episodes": 100, "success": 0.5, "violations": 0.0},
-        "robustness": {
-            "survival_100N": 0.5,
-            "impulse_50": 3.0,
-            "impulse_50_is_lower_bound": False,
-            "surface": {
-                "forces_N": [9.0],
-                "headings_rad": [0.0, 3.0],
-                "phases": [4],
-                "survived": [[[1], [0]]],
-            },
-        },
-    }
-    stage = {"name": "plan", "steps": 8, "physics_substeps": 0, "seconds": 0.5}
-    whose = {"task": NAME, "method": "twostage", "seed": 0, "budget": "smoke"}
-    record.write_json(folder / "score.json", {**whose, "score": score, "stages": [stage]})
+    record.write_json(folder / "score.json", invented_record(NAME).as_dict())
     Checkpoints(folder / "checkpoints", pytest.fail).save(0, "plan", 1, {"values": np.ones(3)})
     return folder
 
@@ -115,7 +97,7 @@ def intact(
 def read_score(folder: Path) -> None:
     content = record.read_score(folder)
     assert tables.run_title(content)
-    assert tables.summary(content)
+    assert tables.summary(content.score)
 
 
 def read_policy(folder: Path) -> None:

@@ -41,8 +41,10 @@ MAY_KNOW: dict[str, set[str]] = {
         "tables", "curves",
     },
     "config": {"errors", "typed", "problem"},
-    "record": {"errors", "files", "typed", "motion", "mdp", "policy", "tasks", "config"},
-    "tables": {"record"},
+    "record": {
+        "errors", "files", "typed", "motion", "mdp", "policy", "tasks", "evaluation", "config",
+    },
+    "tables": {"evaluation", "record"},
     "workspace": {"errors", "typed", "problem", "checkpoint", "record", "tables"},
     "run": {
         "errors", "files", "mdp", "motion", "policy", "problem", "sim", "tasks", "evaluation", "rl",
@@ -60,7 +62,7 @@ ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl"},
     "rsl_rl": {"rl"},
     "tensordict": {"rl"},
-    "threadpoolctl": {"rl"},
+    "threadpoolctl": {"rl", "evaluation"},
     "gymnasium": {"sim", "gym", "bench"},
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},

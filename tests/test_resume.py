@@ -111,11 +111,8 @@ def result(directory: Path) -> dict[str, Any]:
             for row in rows
         ],
         "events": scalars,
-        "score": content["score"],
-        "stages": [
-            (stage["name"], stage["steps"], stage["physics_substeps"])
-            for stage in content["stages"]
-        ],
+        "score": content.score,
+        "stages": [(stage.name, stage.steps, stage.physics_substeps) for stage in content.stages],
         "files": sorted(path.name for path in directory.iterdir()),
     }
 
@@ -258,9 +255,9 @@ def test_the_log_and_the_score_tell_of_the_interruption(unfinished: Path) -> Non
     log = (unfinished / "log.txt").read_text()
     assert "resumed: imitate goes on at 32 steps" in log
     assert "2 iterations after the last checkpoint are done again" in log
-    stages = record.read_score(unfinished)["stages"]
-    assert [stage["interruptions"] for stage in stages] == [0, 1, 0]
-    assert stages[1]["seconds"] > before["seconds"]
+    stages = record.read_score(unfinished).stages
+    assert [stage.interruptions for stage in stages] == [0, 1, 0]
+    assert stages[1].seconds > before["seconds"]
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,11 @@ import math
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +21,18 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from tsbench import cli, config, launch, record, run, tables, tasks
 from tsbench.errors import TsbenchError
+from tsbench.evaluation.protocol import PROTOCOLS, SMOKE
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.policy import Policy
-from tsbench.workspace import RunWorkspace, Stage
+from tsbench.record import Stage
+from tsbench.workspace import RunWorkspace
 
 WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512", "seed=3"]
+
+
+def plain(content: Any) -> Any:
+    """As it is read back from a file."""
+    return json.loads(json.dumps(content))
 
 
 def execute(directory: Path, words: list[str] = WORDS) -> str:
@@ -88,17 +97,17 @@ def test_versions_and_hashes(shown: tuple[Path, str]) -> None:
 
 def test_the_score_says_what_each_stage_used(shown: tuple[Path, str]) -> None:
     content = record.read_score(shown[0])
-    assert (content["task"], content["method"]) == ("rocket_navigation", "twostage")
-    assert content["standard"] is True
-    assert 0.0 <= content["score"]["normalized_reward"] <= 1.0
-    plan, imitate = content["stages"]
-    assert (plan["name"], imitate["name"]) == ("plan", "imitate")
-    assert plan["budget"] == 512 <= plan["steps"]
-    assert imitate["budget"] <= imitate["steps"]
-    assert plan["physics_substeps"] == 0
+    assert (content.task, content.method) == ("rocket_navigation", "twostage")
+    assert content.standard is True
+    assert 0.0 <= content.score.normalized_reward <= 1.0
+    plan, imitate = content.stages
+    assert (plan.name, imitate.name) == ("plan", "imitate")
+    assert plan.budget == 512 <= plan.steps
+    assert imitate.budget <= imitate.steps
+    assert plan.physics_substeps == 0
     substeps = tasks.make("rocket_navigation").substeps
-    assert imitate["physics_substeps"] >= imitate["steps"] * substeps
-    assert plan["seconds"] > 0.0
+    assert imitate.physics_substeps >= imitate.steps * substeps
+    assert plan.seconds > 0.0
 
 
 def test_metrics_are_the_same_in_both_places(shown: tuple[Path, str]) -> None:
@@ -146,7 +155,7 @@ def test_the_same_seed_gives_the_same_bits(finished: Path, tmp_path: Path) -> No
     for name in ("policy.safetensors", "policy.json"):
         assert (finished / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
     first, second = record.read_score(finished), record.read_score(tmp_path / "two")
-    assert first["score"] == second["score"]
+    assert first.score == second.score
     one, two = Plan.load(finished / "plan.npz"), Plan.load(tmp_path / "two" / "plan.npz")
     np.testing.assert_array_equal(one.states, two.states)
 
@@ -166,7 +175,7 @@ def test_evaluate_repeats_the_score(finished: Path, capsys: pytest.CaptureFixtur
     assert comparison == {
         "kind": "exact", "agrees": True, "words": "compared bit for bit: equal",
     }  # fmt: skip
-    assert shown == record.shown(record.read_score(finished))
+    assert shown == plain(record.shown(record.read_score(finished)))
     assert {"normalized_reward", "robustness", "stages"} <= shown.keys()
 
 
@@ -179,13 +188,14 @@ def test_evaluate_needs_the_policy_file_alone(
     words = ["evaluate", "bare", "--protocol", "smoke", "--threads", "1", "--json", "bare.json"]
     assert cli.main(words) == 0
     assert "score.json" not in capsys.readouterr().out
-    assert json.loads(Path("bare.json").read_text()) == record.read_score(finished)["score"]
+    score = plain(record.read_score(finished).score.as_dict())
+    assert json.loads(Path("bare.json").read_text()) == {**score, "standard": True}
 
 
 def test_evaluate_says_when_a_score_is_not_what_the_policy_earns(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = record.read_score(finished)
+    content = json.loads((finished / "score.json").read_text())
     content["score"]["normalized_reward"] = 0.99
     (finished / "score.json").write_text(json.dumps(content))
     assert cli.main(["evaluate", "one"]) == 1
@@ -195,7 +205,7 @@ def test_evaluate_says_when_a_score_is_not_what_the_policy_earns(
 def test_evaluate_replays_where_the_machine_differs(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = record.read_score(finished)
+    content = json.loads((finished / "score.json").read_text())
     content["score"]["origin"]["machine"]["extensions"] = "X86_V9"
     (finished / "score.json").write_text(json.dumps(content))
     assert cli.main(["evaluate", "one"]) == 0
@@ -204,8 +214,18 @@ def test_evaluate_replays_where_the_machine_differs(
     assert "physics replayed from the action log: equal" in shown
 
 
-def test_a_kept_run_is_an_entry(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["evaluate", "one", "--keep", "board/entry"]) == 0
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> str:
+    """A protocol whose scores can be ranked, in seconds."""
+    monkeypatch.setitem(PROTOCOLS, "quick", replace(SMOKE, name="quick", ranked=True))
+    return "quick"
+
+
+def test_a_kept_run_is_an_entry(
+    finished: Path, quick: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keep = ["evaluate", "one", "--protocol", quick, "--keep"]
+    assert cli.main([*keep, "board/entry"]) == 0
     assert "kept in board/entry" in capsys.readouterr().out
     entry = Path("board/entry")
     names = {
@@ -215,15 +235,75 @@ def test_a_kept_run_is_an_entry(finished: Path, capsys: pytest.CaptureFixture[st
     assert {path.name for path in entry.iterdir()} == names
     for name in names - {"score.json", "actions.npz"}:
         assert (entry / name).read_bytes() == (finished / name).read_bytes()
-    assert record.read_score(entry) == record.read_score(finished)
+    kept, before = record.read_score(entry), record.read_score(finished)
+    assert replace(kept, score=before.score) == before
+    assert kept.score.robustness == before.score.robustness
+    assert kept.score.origin.protocol == PROTOCOLS[quick]
     assert cli.main(["evaluate", "board/entry"]) == 0
     assert "compared bit for bit: equal" in capsys.readouterr().out
-    assert cli.main(["evaluate", "one", "--keep", "board/entry"]) == 2
+    assert cli.main([*keep, "board/entry"]) == 2
     assert "board/entry exists and nothing is overwritten" in capsys.readouterr().err
-    (finished / "plan.npz").unlink()
+    assert cli.main([*keep, "board/entry/score.json/x"]) == 2
+    assert "board/entry/score.json/x: Not a directory" in capsys.readouterr().err
     assert cli.main(["evaluate", "one", "--keep", "other"]) == 2
+    assert "a score by protocol smoke cannot be an entry" in capsys.readouterr().err
+    (finished / "plan.npz").unlink()
+    assert cli.main([*keep, "other"]) == 2
     assert "one is no finished two-stage run: it lacks plan.npz" in capsys.readouterr().err
     assert not Path("other").exists()
+
+
+def other_score(run: Path, *path: str, value: Any) -> None:
+    content = json.loads((run / "score.json").read_text())
+    inner = content
+    for name in path[:-1]:
+        inner = inner[name]
+    inner[path[-1]] = value
+    (run / "score.json").write_text(json.dumps(content))
+
+
+def plan_of_another_task(run: Path) -> None:
+    plan = Plan.load(run / "plan.npz")
+    replace(plan, task="rocket_obstacles").save(run / "plan.npz")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "line"),
+    [
+        (lambda run: (run / "reference.npz").write_bytes(b"PK"), "damaged"),
+        (plan_of_another_task, "rocket_obstacles"),
+        (lambda run: other_score(run, "task", value="laikago_trot"), "not of one task"),
+        (lambda run: other_score(run, "method", value="mine"), "not of one method"),
+        (
+            lambda run: other_score(run, "score", "origin", "policy", value="0" * 64),
+            "one mixes several runs: its files are not of one policy",
+        ),
+        (lambda run: (run / "versions.json").write_text("hi"), "damaged versions"),
+    ],
+)
+def test_what_does_not_belong_together_is_no_entry(
+    finished: Path,
+    quick: str,
+    capsys: pytest.CaptureFixture[str],
+    spoil: Callable[[Path], object],
+    line: str,
+) -> None:
+    spoil(finished)
+    assert cli.main(["evaluate", "one", "--protocol", quick, "--keep", "board"]) == 2
+    assert line in capsys.readouterr().err
+    assert not Path("board").exists()
+
+
+def test_a_score_that_does_not_repeat_is_no_entry(
+    finished: Path, quick: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["evaluate", "one", "--protocol", quick, "--keep", "good"]) == 0
+    other_score(Path("good"), "score", "normalized_reward", value=0.99)
+    words = ["evaluate", "good", "--keep", "bad", "--json", "figures.json"]
+    assert cli.main(words) == 1
+    assert "not kept: the score is not what it was" in capsys.readouterr().out
+    assert not Path("bad").exists()
+    assert json.loads(Path("figures.json").read_text())["comparison"]["agrees"] is False
 
 
 @pytest.mark.usefixtures("finished")
@@ -282,7 +362,8 @@ def test_a_run_in_json(
     assert "there.json exists and nothing is overwritten" in capsys.readouterr().err
     assert not Path("r").exists()
     assert cli.main([*words, "--json=r.json", *tiny]) == 0
-    assert json.loads(Path("r.json").read_text()) == record.shown(record.read_score(Path("r")))
+    shown = plain(record.shown(record.read_score(Path("r"))))
+    assert json.loads(Path("r.json").read_text()) == shown
 
 
 @pytest.mark.parametrize("content", [b"", b"rubbish", b"\x00" * 100, b"{}", b"[1]", b"{"])
@@ -381,8 +462,8 @@ def test_changed_constants_are_recorded(tmp_path: Path) -> None:
     words = [*WORDS, "task.constants.distance=20.0", "method=monolithic"]
     execute(tmp_path / "near", words)
     content = record.read_score(tmp_path / "near")
-    assert content["standard"] is False
-    assert [stage["name"] for stage in content["stages"]] == ["train"]
+    assert content.standard is False
+    assert [stage.name for stage in content.stages] == ["train"]
     policy, task = record.read_policy(tmp_path / "near")
     assert task == tasks.make("rocket_navigation", distance=20.0)
     assert policy.info.method == "monolithic"
@@ -424,7 +505,7 @@ def test_a_sweep_goes_on_after_failures_and_lists_them(
     assert second.endswith(f"(log: {places[1] / 'log.txt'})")
     assert "ZeroDivisionError: a bug" in (places[1] / "log.txt").read_text()
     assert last == "tsbench: 2 of the sweep's runs failed (see above)"
-    assert record.read_score(places[2])["seed"] == 2
+    assert record.read_score(places[2]).seed == 2
 
     (places[0] / "notes.txt").unlink()
     before = (places[2] / "score.json").stat().st_mtime_ns
@@ -433,7 +514,7 @@ def test_a_sweep_goes_on_after_failures_and_lists_them(
     assert f"finished already: {places[2]}" in out
     assert "resumed: imitate goes on at " in (places[1] / "log.txt").read_text()
     assert (places[2] / "score.json").stat().st_mtime_ns == before
-    assert [record.read_score(place)["seed"] for place in places] == [0, 1, 2]
+    assert [record.read_score(place).seed for place in places] == [0, 1, 2]
 
 
 def test_a_sweep_does_not_take_another_run_for_its_own(
@@ -483,7 +564,7 @@ def test_mujocos_warnings_are_told(tmp_path: Path) -> None:
         monitor.warnings = {"mjWARN_BADQACC": 1234}
         monitor.update(10, {})
     workspace.close()
-    assert workspace.stage_rows()[0]["warnings"] == {"mjWARN_BADQACC": 1234}
+    assert workspace.stages[0].warnings == {"mjWARN_BADQACC": 1234}
     log = (tmp_path / "log.txt").read_text()
     assert "imitate: mujoco warned 1,234 times of mjWARN_BADQACC" in log
 

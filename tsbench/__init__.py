@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
     from dm_control.rl.control import Environment
 
-    from tsbench.evaluation.evaluate import Score
+    from tsbench.evaluation.score import Score
     from tsbench.motion import ReferenceMotion
     from tsbench.policy import Policy
     from tsbench.sim.batched import BatchedEnvironment
@@ -123,8 +123,8 @@ def evaluate(
     """Scores a policy by the evaluation protocol (`tsbench/evaluation/protocol.py`).
 
     Args:
-        policy: a `tsbench.policy.Policy`, the directory of one, an ONNX file, a
-            stable-baselines3 model, or any function of one observation (o,) that returns one
+        policy: a `tsbench.policy.Policy`, the directory of one, an ONNX file, "zero" or "random",
+            a stable-baselines3 model, or any function of one observation (o,) that returns one
             action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
             `tsbench.adapters.from_sb3`.
         task: its name.
@@ -138,6 +138,7 @@ def evaluate(
 
     from tsbench import adapters, tasks
     from tsbench.evaluation import protocol as protocols
+    from tsbench.evaluation import references
     from tsbench.evaluation.evaluate import evaluate as score
     from tsbench.policy import Policy
 
@@ -145,7 +146,7 @@ def evaluate(
     if protocol not in protocols.PROTOCOLS:
         raise unknown("protocol", protocol, protocols.PROTOCOLS)
     if isinstance(policy, (str, Path)):
-        policy = adapters.load(Path(policy), made)
+        policy = references.named(Path(policy), made) or adapters.load(Path(policy), made)
     if not isinstance(policy, (Policy, adapters.ForeignPolicy)):
         if callable(policy):
             policy = adapters.from_function(policy, made)

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -239,45 +239,56 @@ def _evaluate(words: Sequence[str]) -> int:
         help="directory with a policy in it, .onnx file, stable-baselines3 .zip, zero or random",
     )
     parser.add_argument("task", nargs="?", metavar="task=NAME", help="where the policy says none")
-    parser.add_argument("--protocol", metavar="NAME", help="v1 (default) or smoke, for seconds")
+    parser.add_argument(
+        "--protocol",
+        metavar="NAME",
+        help="v1 or smoke, which takes seconds (as the run was scored, else v1)",
+    )
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
     help_keep = "copy a finished run and this score into a new directory, as leaderboards/ has it"
     parser.add_argument("--keep", type=Path, metavar="DIRECTORY", help=help_keep)
     options = parser.parse_args(words)
-    from tsbench import record, tables
-    from tsbench.evaluation.evaluate import evaluate, perturbed_starts
+    from tsbench import record, tables, tasks
+    from tsbench.evaluation.evaluate import evaluate
     from tsbench.evaluation.protocol import PROTOCOLS, V1
-    from tsbench.evaluation.replay import compare, episode_starts
+    from tsbench.evaluation.replay import compare
 
     path = Path(options.policy)
     policy, task = _policy(path, options.task, options.trust_sb3)
     finished = path.is_dir() and (path / record.SCORE).exists()
     kept = record.read_score(path) if finished else None
-    if options.keep is not None:
-        record.check_keep(path, options.keep)
-    name = options.protocol or (kept["score"].get("protocol", V1.name) if kept else V1.name)
+    name = options.protocol or (kept.score.protocol if kept else V1.name)
     if name not in PROTOCOLS:
         raise unknown("protocol", name, PROTOCOLS)
     protocol = PROTOCOLS[name]
     log = record.read_actions(path) if kept else None
-    score = evaluate(policy, task, protocol=protocol, threads=options.threads)
-    content = score.as_dict()
-    console = Console()
-    console.print(tables.score_table(f"{task.name}: {options.policy}", content))
-    shown, agrees = content, None
+    if options.keep is not None:
+        record.check_keep(path, options.keep, protocol)
+    console, standard = Console(), tasks.standard(task)
+    with tables.progress(console, "evaluate") as progress:
+        score = evaluate(
+            policy, task, protocol=protocol, threads=options.threads, progress=progress
+        )
+    console.print(tables.score_table(f"{task.name}: {options.policy}", score))
+    tables.show_rank(console, standard, score)
+    shown: dict[str, Any] = {**score.as_dict(), "standard": standard}
+    agrees = None
     if kept is not None:
-        starts = episode_starts(task, perturbed_starts(task, protocol))
-        comparison = compare(kept["score"], content, protocol, task, starts, log)
+        comparison = compare(kept.score, score, task, log)
         agrees = comparison.agrees
-        shown = record.shown(kept | {"score": content}) | {"comparison": vars(comparison)}
+        shown = record.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
         line = f" {path / record.SCORE}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    if options.keep is not None:
-        record.keep(path, options.keep, content, score.log)
-        console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
     record.write_json(options.json, shown)
-    return 1 if agrees is False else 0
+    if agrees is False:
+        if options.keep is not None:
+            console.print(" not kept: the score is not what it was", highlight=False)
+        return 1
+    if options.keep is not None:
+        record.keep(path, options.keep, score)
+        console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
+    return 0
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
@@ -308,9 +319,7 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
             raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
         raise TsbenchError(f"no run directory {path}")
     task = tasks.make(name)
-    if str(path) in references.POLICIES and not path.exists():
-        return references.POLICIES[str(path)](task), task
-    return adapters.load(path, task, trust_sb3), task
+    return references.named(path, task) or adapters.load(path, task, trust_sb3), task
 
 
 def _threads(word: str) -> int:

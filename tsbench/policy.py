@@ -59,7 +59,7 @@ class PolicyInfo:
     Attributes:
         task: name of the task it was trained for.
         task_version: of that task.
-        physics: fingerprint of the task's compiled model.
+        physics: fingerprint of the task's MJCF (`sim.model.fingerprint`).
         method: what trained it.
         activation: between layers, a name in `ACTIVATIONS`.
         layers: sizes from observation to action.

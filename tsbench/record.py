@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import shutil
 import tempfile
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from tsbench import tasks
 from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError, os_errors
+from tsbench.evaluation.protocol import Protocol
+from tsbench.evaluation.score import Score
 from tsbench.files import write_whole
 from tsbench.mdp import Task
-from tsbench.motion import ActionLog
+from tsbench.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.policy import Policy
 from tsbench.typed import typed
 
@@ -40,6 +41,59 @@ REPORT = "report.html"
 KEPT = (CONFIG, VERSIONS, "policy.json", "policy.safetensors", PLAN, REFERENCE, SCORE)
 
 
+@dataclass
+class Stage:
+    """What a stage has used so far.
+
+    Attributes:
+        name: as the method calls it.
+        budget: environment steps it may use.
+        steps: environment steps it has used.
+        physics_substeps: steps of the physics under them; none in a kinematic stage.
+        warnings: how often mujoco warned meanwhile, by mujoco's names.
+        seconds: wall-clock of the work that is in the result. What was lost when a run was
+            interrupted, and the time until it was resumed, do not count.
+        interruptions: how often the stage was resumed.
+    """
+
+    name: str
+    budget: int
+    steps: int = 0
+    physics_substeps: int = 0
+    warnings: dict[str, int] = field(default_factory=dict)
+    seconds: float = 0.0
+    interruptions: int = 0
+
+
+@dataclass(frozen=True)
+class Record:
+    """The content of `score.json`.
+
+    Attributes:
+        task: its name.
+        task_version: of it.
+        standard: whether the task has its own constants; another score cannot be ranked.
+        method: that made the policy.
+        seed: of the training.
+        budget: its name.
+        score: of the policy.
+        stages: what the training took.
+    """
+
+    task: str
+    task_version: int
+    standard: bool
+    method: str
+    seed: int
+    budget: str
+    score: Score
+    stages: tuple[Stage, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {**asdict(self), "score": self.score.as_dict()}
+
+
 def read_config(directory: Path) -> RunConfig:
     """The configuration that a run was made with.
 
@@ -59,7 +113,7 @@ def read_config(directory: Path) -> RunConfig:
     return config
 
 
-def read_score(directory: Path) -> dict[str, Any]:
+def read_score(directory: Path) -> Record:
     """The content of a finished run's `score.json`.
 
     Raises:
@@ -69,30 +123,12 @@ def read_score(directory: Path) -> dict[str, Any]:
     with os_errors(path):
         content = path.read_bytes()
     try:
-        record = json.loads(content)
-        score = record["score"]
-        _ = [record[name] for name in ("task", "method", "seed", "budget")]
-        needed = [score[name] for name in ("normalized_reward", "optimality", "success")]
-        needed += [score["perturbed"][name] for name in ("episodes", "success", "violations")]
-        if robustness := score.get("robustness"):
-            needed += [robustness[name] for name in ("survival_100N", "impulse_50")]
-            needed.append(robustness["impulse_50_is_lower_bound"])
-            shape = tuple(
-                len(robustness["surface"][name]) for name in ("forces_N", "headings_rad", "phases")
-            )
-            if np.shape(robustness["surface"]["survived"]) != shape:
-                raise ValueError("the surface of pushes does not fit its axes")
-        for stage in record["stages"]:
-            needed += [stage[name] for name in ("steps", "physics_substeps", "seconds")]
-            _ = str(stage["name"])
-        for value in needed:
-            if not (isinstance(value, (int, float)) and math.isfinite(value)):
-                raise ValueError(f"{value!r} where a number should be")
-    except KeyError as error:
-        raise TsbenchError(f"damaged score {path}: {error} is missing") from None
-    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        values = json.loads(content)
+        json.dumps(values, allow_nan=False)  # raises where a number is not finite
+        record: Record = typed(Record, values, "")
+    except (ValueError, OverflowError, RecursionError, TsbenchError) as error:
         raise TsbenchError(f"damaged score {path}: {error}") from None
-    return dict(record)
+    return record
 
 
 def read_policy(directory: Path) -> tuple[Policy, Task[Any]]:
@@ -112,6 +148,21 @@ def read_policy(directory: Path) -> tuple[Policy, Task[Any]]:
     return policy, tasks.make(policy.info.task, **constants)
 
 
+def read_versions(directory: Path) -> dict[str, Any]:
+    """What a run was made with, as `versions.json` has it.
+
+    Raises:
+        TsbenchError: the file is missing or damaged.
+    """
+    path = directory / VERSIONS
+    with os_errors(path):
+        content = path.read_bytes()
+    try:
+        return dict(json.loads(content))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise TsbenchError(f"damaged versions {path}: {error}") from None
+
+
 def read_actions(directory: Path) -> ActionLog | None:
     """The action log of a run, if it has one.
 
@@ -122,40 +173,60 @@ def read_actions(directory: Path) -> ActionLog | None:
     return ActionLog.load(path) if path.exists() else None
 
 
-def check_keep(run: Path, entry: Path) -> None:
+def check_keep(run: Path, entry: Path, protocol: Protocol) -> None:
     """
     Raises:
         TsbenchError: `keep` could not work, whatever the score.
     """
+    if not protocol.ranked:
+        raise TsbenchError(f"a score by protocol {protocol.name} cannot be an entry")
     missing = [name for name in KEPT if not (run / name).exists()]
     if missing:
         raise TsbenchError(f"{run} is no finished two-stage run: it lacks {', '.join(missing)}")
-    if not tasks.standard(read_policy(run)[1]):
+    policy, task = read_policy(run)
+    if not tasks.standard(task):
         raise TsbenchError(f"{run} was made with changed constants: it cannot be an entry")
+    record = read_score(run)
+    read_versions(run)
+    for what, here, there in (
+        ("task", policy.info.task, record.task),
+        ("task", policy.info.task, read_config(run).task.name),
+        ("method", policy.info.method, record.method),
+        ("policy", policy.info.sha256, record.score.origin.policy),
+    ):
+        if here != there:
+            raise TsbenchError(f"{run} mixes several runs: its files are not of one {what}")
+    for motion in (Plan.load(run / PLAN), ReferenceMotion.load(run / REFERENCE)):
+        task.check_fit(motion)
     if entry.exists():
         raise TsbenchError(f"{entry} exists and nothing is overwritten")
+    _check_writable(entry, next(one for one in entry.absolute().parents if one.exists()))
 
 
-def keep(run: Path, entry: Path, score: dict[str, Any], log: ActionLog) -> None:
+def keep(run: Path, entry: Path, score: Score) -> None:
     """Copies what matters of a run into a new directory, with a score made now.
 
     Raises:
-        TsbenchError: the run is not finished, or the directory exists or cannot be written.
+        TsbenchError: the run is not finished or not of one piece, the score cannot be ranked, or
+            the directory exists or cannot be written.
     """
-    check_keep(run, entry)
-    content = read_score(run) | {"score": score}
+    check_keep(run, entry, score.origin.protocol)
+    assert score.log is not None
+    content = replace(read_score(run), score=score).as_dict()
     with os_errors(entry):
         entry.mkdir(parents=True)
         for name in KEPT:
             if name != SCORE:
                 shutil.copy(run / name, entry / name)
-        log.save(entry / ACTIONS)
+        score.log.save(entry / ACTIONS)
     write_json(entry / SCORE, content)
 
 
-def shown(record: dict[str, Any]) -> dict[str, Any]:
-    """What `--json` has of a run: its score's figures, and what its stages took."""
-    return {**record["score"], "stages": record["stages"]}
+def shown(record: Record) -> dict[str, Any]:
+    """What `--json` has of a run: its score's figures, whether they can be ranked with those of
+    others (`standard`), and what its stages took."""
+    values = record.as_dict()
+    return {**values["score"], "standard": values["standard"], "stages": values["stages"]}
 
 
 def check_new(path: Path) -> None:
@@ -165,8 +236,12 @@ def check_new(path: Path) -> None:
     """
     if path.exists():
         raise TsbenchError(f"{path} exists and nothing is overwritten")
+    _check_writable(path, path.parent)
+
+
+def _check_writable(path: Path, folder: Path) -> None:
     try:
-        with tempfile.TemporaryFile(dir=path.parent):
+        with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise TsbenchError(f"{path}: {error.strerror}") from None

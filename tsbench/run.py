@@ -26,8 +26,9 @@ from rich.console import Console
 from tsbench import curves, methods, tables, tasks
 from tsbench.config import RunConfig
 from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
-from tsbench.evaluation.evaluate import Score, evaluate
+from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
+from tsbench.evaluation.score import Score
 from tsbench.files import PART, write_whole
 from tsbench.problem import Problem
 from tsbench.record import (
@@ -41,8 +42,10 @@ from tsbench.record import (
     REPORT,
     SCORE,
     VERSIONS,
+    Record,
     read_config,
     read_score,
+    read_versions,
     write_json,
 )
 from tsbench.rl.stages import KINDS, settings
@@ -163,7 +166,7 @@ def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
         )
     if (directory / SCORE).exists():
         Console().print(f"finished already: {directory}", highlight=False, soft_wrap=True)
-        return float(read_score(directory)["score"]["normalized_reward"])
+        return read_score(directory).score.normalized_reward
     return resume(directory).normalized_reward
 
 
@@ -251,21 +254,25 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
     policy = methods.find(config.method["name"]).train(problem, workspace)
     policy.save(directory)
     protocol = SMOKE if config.budget == SMOKE.name else V1
-    score = evaluate(policy, problem.task, protocol=protocol, threads=problem.threads)
+    with tables.progress(console, "evaluate") as progress:
+        score = evaluate(
+            policy, problem.task, protocol=protocol, threads=problem.threads, progress=progress
+        )
+    assert score.log is not None
     score.log.save(directory / ACTIONS)
-    record = {
-        "task": problem.task.name,
-        "task_version": problem.task.version,
-        "standard": tasks.standard(problem.task),
-        "method": config.method["name"],
-        "seed": config.seed,
-        "budget": config.budget,
-        "score": score.as_dict(),
-        "stages": workspace.stage_rows(),
-    }
+    record = Record(
+        task=problem.task.name,
+        task_version=problem.task.version,
+        standard=tasks.standard(problem.task),
+        method=config.method["name"],
+        seed=config.seed,
+        budget=config.budget,
+        score=score,
+        stages=tuple(replace(stage, seconds=round(stage.seconds, 3)) for stage in workspace.stages),
+    )
     curves.draw(directory / METRICS, directory / CURVES)
     write_run_pages(directory, record)
-    write_json(directory / SCORE, record)  # last: its presence says that the run is finished
+    write_json(directory / SCORE, record.as_dict())  # last: it says that the run is finished
     tables.show_run(console, record, directory)
     return score
 
@@ -337,12 +344,7 @@ def _check_provenance(directory: Path, config: RunConfig, problem: Problem) -> N
         TsbenchError: a run begun as `versions.json` says would not go on to the same bits now.
     """
     path = directory / VERSIONS
-    with os_errors(path):
-        content = path.read_bytes()
-    try:
-        before = dict(json.loads(content))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise TsbenchError(f"damaged versions {path}: {error}") from None
+    before = read_versions(directory)
     for name, now in _identity(config, problem).items():
         if before.get(name) != now:
             raise TsbenchError(

@@ -21,37 +21,13 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 from tsbench.checkpoint import Checkpoint, Checkpoints
 from tsbench.errors import Stopped, TsbenchError
 from tsbench.problem import Monitor, Snapshot
-from tsbench.record import CHECKPOINTS, EVENTS, LOG, METRICS
+from tsbench.record import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
 from tsbench.tables import duration, number
 from tsbench.typed import typed
 
 INTERVAL = 30.0  # seconds of training between checkpoints
 PLAIN_INTERVAL = 60.0  # seconds between lines where there is no terminal to draw a bar on
 PLAIN_SHARE = 0.1  # or this share of the stage, whichever is first
-
-
-@dataclass
-class Stage:
-    """What a stage has used so far.
-
-    Attributes:
-        name: as the method calls it.
-        budget: environment steps it may use.
-        steps: environment steps it has used.
-        physics_substeps: steps of the physics under them; none in a kinematic stage.
-        warnings: how often mujoco warned meanwhile, by mujoco's names.
-        seconds: wall-clock of the work that is in the result. What was lost when a run was
-            interrupted, and the time until it was resumed, do not count.
-        interruptions: how often the stage was resumed.
-    """
-
-    name: str
-    budget: int
-    steps: int = 0
-    physics_substeps: int = 0
-    warnings: dict[str, int] = field(default_factory=dict)
-    seconds: float = 0.0
-    interruptions: int = 0
 
 
 @dataclass(frozen=True)
@@ -298,10 +274,6 @@ class RunWorkspace:
             self._saved_at = time.perf_counter()
         if self._stopped_by is not None:
             raise Stopped(self._stopped_by)
-
-    def stage_rows(self) -> list[dict[str, Any]]:
-        """The stages as plain values, for `score.json`."""
-        return [{**asdict(stage), "seconds": round(stage.seconds, 3)} for stage in self.stages]
 
     def _write_event(self, event: Event) -> None:
         self._events.write(event.SerializeToString())

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tsbench import record, tasks
-from tsbench.evaluation.evaluate import check_fit, evaluate, perturbed_starts
+from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.protocol import PROTOCOLS
-from tsbench.evaluation.replay import compare, episode_starts, replay
+from tsbench.evaluation.replay import compare, replay
 from tsbench.motion import Plan, ReferenceMotion
 
 BOARDS = Path(__file__).parents[2] / "leaderboards"
@@ -31,50 +30,46 @@ def test_an_entry_holds_together(entry: Path) -> None:
     check_fit(policy, task)
     assert tasks.standard(task)
     content = record.read_score(entry)
-    assert (content["task"], content["method"]) == entry.parts[-3:-1] == (
+    assert (content.task, content.method) == entry.parts[-3:-1] == (
         policy.info.task, policy.info.method,
     )  # fmt: skip
-    score = content["score"]
-    assert PROTOCOLS[score["protocol"]].ranked
-    assert score["origin"]["policy"] == policy.info.sha256
+    score = content.score
+    assert content.standard
+    assert score.origin.protocol == PROTOCOLS[entry.parts[-4]]
+    assert score.origin.protocol.ranked
+    assert score.origin.policy == policy.info.sha256
     assert (entry / record.CONFIG).read_text().startswith("# tsbench run ")
     assert Plan.load(entry / record.PLAN).task == task.name
     assert ReferenceMotion.load(entry / record.REFERENCE).task == task.name
-    assert score["success"] == 1.0
+    assert score.success == score.perturbed.success == 1.0
+    assert score.robustness.survival_100N == 1.0  # the paper's claim
+    if task.pushed == "trunk":
+        assert score.robustness.impulse_50 >= 40.0
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
 def test_an_entry_repeats(entry: Path) -> None:
     """The physics from the action log, and the policy's own episode."""
     policy, task = record.read_policy(entry)
-    score: dict[str, Any] = record.read_score(entry)["score"]
-    protocol = PROTOCOLS[score["protocol"]]
+    score = record.read_score(entry).score
     log = record.read_actions(entry)
     assert log is not None
-    starts = episode_starts(task, perturbed_starts(task, protocol))
-    again = evaluate(policy, task, protocol=PROTOCOLS["smoke"], threads=1).as_dict()
-    same_machine = again["origin"]["packages"] == score["origin"]["packages"] and (
-        again["origin"]["machine"] == score["origin"]["machine"]
-    )
-    for name in ("task_version", "constants", "model"):  # else it is never compared again
-        assert again["origin"][name] == score["origin"][name]
-    if again["origin"]["packages"]["mujoco"] == score["origin"]["packages"]["mujoco"]:
-        assert replay(task, starts, log)
-    if same_machine:
-        assert again["nominal"] == score["nominal"]
-    assert again["nominal"]["normalized_reward"] == pytest.approx(
-        score["normalized_reward"], abs=protocol.tolerance
-    )
-    assert compare(score, again, protocol, task, starts, log).kind == "none"  # other protocols
+    again = evaluate(policy, task, protocol=PROTOCOLS["smoke"], threads=1)
+    then, now = score.origin, again.origin
+    for name in ("task_version", "constants", "mjcf"):  # else it is never compared again
+        assert getattr(now, name) == getattr(then, name)
+    if now.packages["mujoco"] == then.packages["mujoco"]:
+        assert now.model == then.model
+        assert replay(task, score, log)
+    if (now.packages, now.machine) == (then.packages, then.machine):
+        assert again.nominal == score.nominal
+    assert again.optimality == pytest.approx(score.optimality, abs=then.protocol.tolerance)
+    assert compare(score, again, task, log).kind == "none"  # other protocols
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
 def test_the_surface_fits_its_summary(entry: Path) -> None:
-    robustness = record.read_score(entry)["score"]["robustness"]
-    surface = robustness["surface"]
-    survived = np.array(surface["survived"])
-    assert survived.shape == tuple(
-        len(surface[name]) for name in ("forces_N", "headings_rad", "phases")
-    )
-    at_claim = np.isclose(surface["forces_N"], 100.0 * robustness["mass_scale"])
-    assert survived[at_claim].mean() == robustness["survival_100N"]
+    robustness = record.read_score(entry).score.robustness
+    surface = robustness.surface
+    at_claim = np.isclose(surface.forces_N, 100.0 * robustness.mass_scale)
+    assert np.array(surface.survived)[at_claim].mean() == robustness.survival_100N

@@ -12,7 +12,8 @@ import pytest
 
 import tsbench
 from tsbench import TsbenchError, tasks
-from tsbench.evaluation.evaluate import best_return, check_fit, evaluate
+from tsbench.evaluation.evaluate import check_fit, evaluate
+from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import SMOKE, Protocol
 from tsbench.policy import Policy, PolicyInfo
 from tsbench.sim.episodes import PolicyFunction
@@ -172,6 +173,17 @@ def test_success_needs_an_episode_without_violation() -> None:
 
 
 # What is reachable
+
+
+def test_progress_rises_to_the_end() -> None:
+    """Which is told before the last actions are known, and never too much."""
+    task = tasks.make("rocket_navigation", distance=6.0)
+    shares: list[float] = []
+    score = evaluate(idle(2), task, protocol=few(2), progress=shares.append)
+    assert shares == sorted(shares)
+    assert 0.0 < shares[0] < 0.1
+    assert 0.9 < shares[-1] <= 1.0
+    assert evaluate(idle(2), task, protocol=few(2)) == score
 
 
 def test_best_return_of_the_rocket_by_hand() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,22 +11,18 @@ import numpy as np
 import pytest
 
 from tsbench import TsbenchError, tasks
-from tsbench.evaluation.evaluate import Score, evaluate, perturbed_starts
+from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.oracle import best_return
+from tsbench.evaluation.origin import constants_hash, machine
 from tsbench.evaluation.protocol import SMOKE
-from tsbench.evaluation.replay import (
-    Comparison,
-    compare,
-    constants_hash,
-    differences,
-    episode_starts,
-    machine,
-    replay,
-)
-from tsbench.mdp import Start
+from tsbench.evaluation.replay import compare, differences, replay
+from tsbench.evaluation.score import Score
 from tsbench.motion import ActionLog
+from tsbench.typed import typed
 
 PROTOCOL = replace(SMOKE, perturbed=3, logged=2, conditions=SMOKE.conditions[:1], forces=(100.0,))
 TASK = tasks.make("laikago_trot", distance=0.4)  # 19 steps
+BEST = best_return(TASK) / (TASK.max_reward * TASK.horizon)
 
 
 def shuffle(observation: np.ndarray) -> np.ndarray:
@@ -41,30 +36,34 @@ def score() -> Score:
 
 
 @pytest.fixture(scope="module")
-def starts() -> Start:
-    return episode_starts(TASK, perturbed_starts(TASK, PROTOCOL))
+def log(score: Score) -> ActionLog:
+    assert score.log is not None
+    return score.log
 
 
-@pytest.fixture
-def kept(score: Score) -> Any:
-    """As it is read back from a file."""
-    return json.loads(json.dumps(score.as_dict()))
+def elsewhere(score: Score, **changes: Any) -> Score:
+    """The same, but made where something was different."""
+    return replace(score, origin=replace(score.origin, **changes))
 
 
-def compared(kept: Any, score: Score, starts: Start, log: ActionLog | None) -> Comparison:
-    return compare(kept, score.as_dict(), PROTOCOL, TASK, starts, log)
+def on_another_machine(score: Score) -> Score:
+    return elsewhere(score, machine=score.origin.machine | {"extensions": "other"})
 
 
-def test_what_a_score_says_of_its_origin(kept: Any) -> None:
-    origin = kept["origin"]
-    assert (origin["protocol"], origin["task"], origin["task_version"]) == (
-        "smoke", "laikago_trot", TASK.version,
-    )  # fmt: skip
-    assert set(origin["packages"]) == {"python", "mujoco", "numpy", "scipy", "tsbench"}
-    assert origin["machine"] == machine()
-    assert origin["machine"]["architecture"]
-    assert len({origin["mjcf"], origin["model"], origin["constants"]}) == 3
-    assert origin["policy"] is None  # a function has no file
+def test_a_score_is_read_back_as_it_was(score: Score) -> None:
+    assert typed(Score, json.loads(json.dumps(score.as_dict())), "") == score
+
+
+def test_what_a_score_says_of_its_origin(score: Score) -> None:
+    origin = score.origin
+    assert (origin.protocol, origin.protocol.seed) == (PROTOCOL, 0)
+    assert (origin.task, origin.task_version) == ("laikago_trot", TASK.version)
+    assert set(origin.packages) == {"python", "mujoco", "numpy", "scipy", "tsbench"}
+    assert origin.machine == machine()
+    assert origin.machine["architecture"]
+    assert origin.machine["blas"].split()[0] in ("openblas", "mkl", "blis", "flexiblas", "None")
+    assert len({origin.mjcf, origin.model, origin.constants}) == 3
+    assert origin.policy is None  # a function has no file
 
 
 def test_the_constants_hash(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,114 +85,136 @@ def test_the_constants_hash(monkeypatch: pytest.MonkeyPatch) -> None:
     assert before != constants_hash(rocket)
 
 
-def test_bit_for_bit(kept: Any, score: Score, starts: Start) -> None:
-    found = compared(kept, score, starts, score.log)
+def test_bit_for_bit(score: Score, log: ActionLog) -> None:
+    found = compare(score, score, TASK, log)
     assert (found.kind, found.agrees) == ("exact", True)
     assert found.words == "compared bit for bit: equal"
-    kept["perturbed"]["normalized_reward"] = np.nextafter(
-        kept["perturbed"]["normalized_reward"], 1.0
-    )
-    found = compared(kept, score, starts, score.log)
+    perturbed = score.perturbed
+    least = float(np.nextafter(perturbed.normalized_reward, 1.0))
+    kept = replace(score, perturbed=replace(perturbed, normalized_reward=least))
+    found = compare(kept, score, TASK, log)
     assert (found.kind, found.agrees) == ("exact", False)
     assert found.words == "compared bit for bit: DIFFERENT"
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "words"),
+    ("changes", "words"),
     [
-        ("protocol", "v1", "another protocol (v1, not smoke)"),
-        ("task_version", 0, "another version of the task (0, not 1)"),
-        ("mjcf", "0", "another MJCF"),
-        ("model", "0", "another model"),
-        ("constants", "0", "another set of constants of the task"),
-        ("policy", "0", "another policy"),
+        ({"protocol": replace(PROTOCOL, name="v1")}, "another protocol (v1, not smoke)"),
+        ({"protocol": replace(PROTOCOL, seed=1)}, "other numbers in the protocol"),
+        ({"task": "laikago_walk"}, "another task (laikago_walk, not laikago_trot)"),
+        ({"task_version": 0}, "another version of the task (0, not 1)"),
+        ({"mjcf": "0"}, "another MJCF"),
+        ({"model": "0"}, "another model"),
+        ({"constants": "0"}, "another set of constants of the task"),
+        ({"policy": "0"}, "another policy"),
     ],
 )
 def test_nothing_to_compare(
-    kept: Any, score: Score, starts: Start, key: str, value: Any, words: str
+    score: Score, log: ActionLog, changes: dict[str, Any], words: str
 ) -> None:
-    kept["origin"][key] = value
-    found = compared(kept, score, starts, score.log)
+    found = compare(elsewhere(score, **changes), score, TASK, log)
     assert (found.kind, found.agrees) == ("none", None)
     assert found.words == f"not compared: made with {words}"
 
 
-def test_another_mujoco(kept: Any, score: Score, starts: Start) -> None:
-    here = kept["origin"]["packages"]["mujoco"]
-    kept["origin"]["packages"]["mujoco"] = "3.16.0"
-    found = compared(kept, score, starts, score.log)
+def test_another_mujoco(score: Score, log: ActionLog) -> None:
+    """It compiles another model, and that is not what is to be told."""
+    here = score.origin.packages["mujoco"]
+    packages = score.origin.packages | {"mujoco": "3.16.0"}
+    found = compare(elsewhere(score, packages=packages, model="0"), score, TASK, log)
     assert (found.kind, found.agrees) == ("none", None)
-    assert found.words == f"not compared: made with mujoco 3.16.0, and this is mujoco {here}"
-
-
-def test_a_score_from_before_there_were_protocols(score: Score, starts: Start) -> None:
-    found = compared({"normalized_reward": 0.5}, score, starts, None)
-    assert (found.kind, found.agrees) == ("none", None)
+    assert found.words == f"not compared: made with another mujoco (3.16.0, not {here})"
 
 
 @pytest.mark.parametrize(("group", "name"), [("packages", "numpy"), ("machine", "extensions")])
-def test_another_kind_of_machine(
-    kept: Any, score: Score, starts: Start, group: str, name: str
-) -> None:
+def test_another_kind_of_machine(score: Score, log: ActionLog, group: str, name: str) -> None:
     """The physics is replayed from the actions, the rest may differ a little."""
-    kept["origin"][group][name] = "other"
-    kept["perturbed"]["normalized_reward"] += 0.9 * PROTOCOL.tolerance
-    kept["robustness"]["impulse_50"] *= 1.05
-    found = compared(kept, score, starts, score.log)
+    there = elsewhere(score, **{group: getattr(score.origin, group) | {name: "other"}})
+    reward = score.perturbed.normalized_reward
+    near = replace(score.perturbed, normalized_reward=reward + 0.9 * PROTOCOL.tolerance * BEST)
+    impulse = score.robustness.impulse_50
+    kept = replace(
+        there, perturbed=near, robustness=replace(score.robustness, impulse_50=1.05 * impulse)
+    )
+    found = compare(kept, score, TASK, log)
     assert (found.kind, found.agrees) == ("tolerant", True)
-    assert f"({name} other there, {score.as_dict()['origin'][group][name]} here)" in found.words
+    assert f"({name} other there, {getattr(score.origin, group)[name]} here)" in found.words
     assert "within 0.05" in found.words
     assert "in agreement" in found.words
     assert found.words.endswith("replayed from the action log: equal")
 
-    kept["perturbed"]["normalized_reward"] += 0.2 * PROTOCOL.tolerance
-    kept["robustness"]["impulse_50"] = 3.0 + 2.0 * score.robustness.impulse_50
-    found = compared(kept, score, starts, score.log)
+    far = replace(score.perturbed, normalized_reward=reward + 1.1 * PROTOCOL.tolerance * BEST)
+    kept = replace(
+        there, perturbed=far, robustness=replace(score.robustness, impulse_50=3.0 + 2.0 * impulse)
+    )
+    found = compare(kept, score, TASK, log)
     assert (found.kind, found.agrees) == ("tolerant", False)
     assert "DIFFERENT: perturbed.normalized_reward" in found.words
     assert "robustness.impulse_50" in found.words
 
-    found = compared(kept, score, starts, None)
-    assert "no action log" in found.words
+    assert "no action log" in compare(kept, score, TASK, None).words
 
 
 def test_a_difference_of_just_the_tolerance(score: Score) -> None:
     """One episode of twenty: 0.55 - 0.5 is 0.05 and a little."""
-    there, here = (json.loads(json.dumps(score.as_dict())) for _ in range(2))
-    there["perturbed"]["violations"], here["perturbed"]["violations"] = 0.5, 0.55
-    assert differences(there, here, PROTOCOL) == []
-    here["perturbed"]["violations"] = 0.5501
-    assert differences(there, here, PROTOCOL) == ["perturbed.violations 0.5 there, 0.5501 here"]
+
+    def spoiled(share: float) -> Score:
+        return replace(score, perturbed=replace(score.perturbed, violations=share))
+
+    assert differences(spoiled(0.5), spoiled(0.55), BEST) == []
+    assert differences(spoiled(0.5), spoiled(0.5501), BEST) == [
+        "perturbed.violations 0.5 there, 0.5501 here"
+    ]
 
 
-def test_replay_finds_any_change(score: Score, starts: Start) -> None:
+def test_rewards_are_compared_on_the_scale_of_the_best(score: Score) -> None:
+    """A trot earns hundredths of the largest conceivable reward: 0.05 of that says nothing."""
+    other = replace(score, normalized_reward=score.normalized_reward + 0.06 * BEST)
+    assert [words.split()[0] for words in differences(other, score, BEST)] == ["normalized_reward"]
+
+
+def test_replay_finds_any_change(score: Score, log: ActionLog) -> None:
     """But for what another processor's kernels change in a reward."""
-    assert score.log.actions.shape == (19, 3, 12)
-    assert replay(TASK, starts, score.log)
-    actions = score.log.actions.copy()
+    assert log.actions.shape == (19, 3, 12)
+    assert replay(TASK, score, log)
+    actions = log.actions.copy()
     actions[0, 1, 5] += 1e-9
-    assert not replay(TASK, starts, replace(score.log, actions=actions))
-    rewards = score.log.rewards.copy()
+    assert not replay(TASK, score, replace(log, actions=actions))
+    rewards = log.rewards.copy()
     rewards[1, 2] = np.nextafter(rewards[1, 2], 1.0)
-    assert replay(TASK, starts, replace(score.log, rewards=rewards))
+    assert replay(TASK, score, replace(log, rewards=rewards))
     rewards[1, 2] *= 1.0 + 1e-11
-    assert not replay(TASK, starts, replace(score.log, rewards=rewards))
+    assert not replay(TASK, score, replace(log, rewards=rewards))
+    assert not replay(TASK, replace(score, normalized_reward=score.normalized_reward * 1.01), log)
+
+
+def test_a_log_of_something_else_does_not_replay(score: Score, log: ActionLog) -> None:
+    shorter = replace(log, actions=log.actions[:1], rewards=log.rewards[:1])
+    fewer = replace(log, actions=log.actions[:, :2], rewards=log.rewards[:, :2])
+    more = replace(
+        log, actions=np.tile(log.actions, (1, 2, 1)), rewards=np.tile(log.rewards, (1, 2))
+    )
+    narrower = replace(log, actions=log.actions[..., :2])
+    for other in (shorter, fewer, more, narrower, replace(log, task="laikago_walk")):
+        assert not replay(TASK, score, other)
+    assert not replay(TASK, score, replace(log, task_version=2))
 
 
 def test_a_log_on_another_kind_of_machine_that_does_not_replay(
-    kept: Any, score: Score, starts: Start
+    score: Score, log: ActionLog
 ) -> None:
-    kept["origin"]["machine"]["libc"] = "other"
-    log = replace(score.log, rewards=copy.deepcopy(score.log.rewards) + 1e-9)
-    found = compared(kept, score, starts, log)
+    found = compare(
+        on_another_machine(score), score, TASK, replace(log, rewards=log.rewards + 1e-9)
+    )
     assert (found.kind, found.agrees) == ("tolerant", False)
     assert found.words.endswith("action log: DIFFERENT")
 
 
-def test_the_log_is_a_file(score: Score, tmp_path: Path) -> None:
-    score.log.save(tmp_path / "actions.npz")
+def test_the_log_is_a_file(log: ActionLog, tmp_path: Path) -> None:
+    log.save(tmp_path / "actions.npz")
     again = ActionLog.load(tmp_path / "actions.npz")
-    np.testing.assert_array_equal(again.actions, score.log.actions)
-    np.testing.assert_array_equal(again.rewards, score.log.rewards)
+    np.testing.assert_array_equal(again.actions, log.actions)
+    np.testing.assert_array_equal(again.rewards, log.rewards)
     with pytest.raises(TsbenchError, match="do not match"):
         replace(again, rewards=again.rewards[:5])

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsbench import tasks
-from tsbench.evaluation.evaluate import evaluate, perturbed_starts
-from tsbench.evaluation.protocol import SMOKE, V1, Condition, Protocol
+from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.protocol import SMOKE, V1, Condition, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import (
     impulse_50,
     mass_scale,

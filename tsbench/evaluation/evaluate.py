@@ -1,16 +1,18 @@
-"""The score of a policy on a task, by a protocol."""
+"""How a policy is scored, by a protocol."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from tsbench.errors import TsbenchError
-from tsbench.evaluation.protocol import V1, Protocol
-from tsbench.evaluation.replay import Origin
-from tsbench.evaluation.robustness import Robustness, robustness
+from tsbench.evaluation.oracle import best_return
+from tsbench.evaluation.origin import Origin
+from tsbench.evaluation.protocol import V1, Protocol, perturbed_starts
+from tsbench.evaluation.robustness import robustness
+from tsbench.evaluation.score import Score, Summary
 from tsbench.mdp import Start, Task
 from tsbench.motion import ActionLog
 from tsbench.policy import Policy
@@ -20,75 +22,31 @@ from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Means over episodes.
-
-    Attributes:
-        episodes: how many.
-        normalized_reward: return over the largest conceivable one.
-        success: share of episodes solved, as judged at their end.
-        violations: share spoiled on the way: a fall, a collision.
-        steps: mean length in control steps.
-        goal_distance: mean at the end, in metres.
-    """
-
-    episodes: int
-    normalized_reward: float
-    success: float
-    violations: float
-    steps: float
-    goal_distance: float
-
-
-@dataclass(frozen=True)
-class Score:
-    """Attributes:
-    protocol: its name.
-    normalized_reward: of the episode from the task's own start.
-    optimality: its return over that of the best motion known (`Task.ideal`).
-    success: whether that episode was solved, 0 or 1.
-    nominal: that episode.
-    perturbed: episodes from perturbed starts.
-    changes: episodes in changed physics, by the name of the condition.
-    robustness: survival under pushes.
-    origin: what it depends on.
-    log: actions to replay the physics from.
-    """
-
-    protocol: str
-    normalized_reward: float
-    optimality: float
-    success: float
-    nominal: Summary
-    perturbed: Summary
-    changes: dict[str, Summary]
-    robustness: Robustness
-    origin: Origin
-    log: ActionLog = field(compare=False, repr=False)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, all but the log."""
-        values = {name: value for name, value in vars(self).items() if name != "log"}
-        for name in ("nominal", "perturbed", "robustness", "origin"):
-            values[name] = asdict(values[name])
-        return values | {"changes": {name: asdict(part) for name, part in self.changes.items()}}
-
-
 def evaluate(
     policy: PolicyFunction,
     task: Task[Any],
     *,
     protocol: Protocol = V1,
     threads: int | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Score:
-    """Scores a policy. `threads` None means all cores, and changes nothing but the time.
+    """Scores a policy.
+
+    Args:
+        policy: of the task.
+        task: with the constants that it is scored under.
+        protocol: that says how.
+        threads: for the physics, None for all cores; they change nothing but the time.
+        progress: is told now and then which share is done, up to 1.
 
     Raises:
         TsbenchError: the policy was trained for another task, version or physics.
     """
     if isinstance(policy, Policy):
         check_fit(policy, task)
+    origin = Origin.here(task, protocol, policy)
+    if progress is not None:
+        policy = _watched(policy, task, protocol, progress)
     nominal = play(task, Physics(task, 1, threads=threads), policy, 1)
     starts = perturbed_starts(task, protocol)
     perturbed = _play(policy, task, starts, threads)
@@ -108,7 +66,7 @@ def evaluate(
             for condition in protocol.conditions
         },
         robustness=robustness(policy, task, protocol, threads),
-        origin=Origin.here(task, protocol, policy),
+        origin=origin,
         log=ActionLog(
             task=task.name,
             task_version=task.version,
@@ -119,18 +77,27 @@ def evaluate(
     )
 
 
+def _watched(
+    policy: PolicyFunction, task: Task[Any], protocol: Protocol, progress: Callable[[float], None]
+) -> PolicyFunction:
+    """The policy, telling how many of all observations it has answered. Episodes that end early
+    make it jump."""
+    phases = np.array(task.push_steps[:: protocol.phases])
+    pushes = len(protocol.forces) * protocol.headings * int((task.horizon - phases).sum())
+    episodes = 2 + protocol.perturbed + len(protocol.conditions) * protocol.changed
+    total, seen = episodes * task.horizon + pushes, 0
+
+    def watched(observation: np.ndarray) -> np.ndarray:
+        nonlocal seen
+        seen += len(observation)
+        progress(seen / total)
+        return policy(observation)
+
+    return watched
+
+
 def _logged(nominal: np.ndarray, perturbed: np.ndarray, protocol: Protocol) -> np.ndarray:
     return np.concatenate([nominal, perturbed[:, : protocol.logged]], axis=1)
-
-
-def perturbed_starts(task: Task[Any], protocol: Protocol) -> Start:
-    """Episode i starts as a dm_control environment of the task seeded with (seed, i) does."""
-    return Start.joined(
-        [
-            task.start(np.random.default_rng((protocol.seed, episode)), 1, perturbed=True)
-            for episode in range(protocol.perturbed)
-        ]
-    )
 
 
 def check_fit(policy: Policy, task: Task[Any]) -> None:
@@ -148,17 +115,6 @@ def check_fit(policy: Policy, task: Task[Any]) -> None:
         raise TsbenchError(
             f"the policy was trained for {task.name} with another model or other constants"
         )
-
-
-def best_return(task: Task[Any]) -> float:
-    """The return of `Task.ideal`: what is reachable, since no motion earns the largest
-    conceivable reward at every step."""
-    states = task.ideal()
-    before, after = states.rows(slice(0, -1)), states.rows(slice(1, None))
-    rewards = task.reward(before, np.zeros((task.horizon, task.action_size)), after)
-    length = int(np.argmax([*task.terminal(after), True])) + 1
-    credit = (task.horizon - length) * task.max_reward if length <= task.horizon else 0.0
-    return float(rewards[:length].sum()) + credit
 
 
 def _play(

@@ -24,9 +24,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from tsbench.mdp import Start, Task
 from tsbench.sim.change import Change
 
 REFERENCE_MASS = 25.433  # kg, of Laikago
@@ -121,3 +123,13 @@ SMOKE = Protocol(
     forces=(100, 400),
 )
 PROTOCOLS = {protocol.name: protocol for protocol in (V1, SMOKE)}
+
+
+def perturbed_starts(task: Task[Any], protocol: Protocol) -> Start:
+    """Episode i starts as a dm_control environment of the task seeded with (seed, i) does."""
+    return Start.joined(
+        [
+            task.start(np.random.default_rng((protocol.seed, episode)), 1, perturbed=True)
+            for episode in range(protocol.perturbed)
+        ]
+    )

@@ -16,8 +16,10 @@ import numpy as np
 
 from tsbench import tasks
 from tsbench.adapters import ForeignPolicy, from_function
-from tsbench.evaluation.evaluate import Score, best_return, evaluate
+from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import V1
+from tsbench.evaluation.score import Score
 from tsbench.mdp import MDP, Task
 
 FILE = Path(__file__).with_name("references.json")
@@ -42,6 +44,12 @@ def random(mdp: MDP[Any]) -> ForeignPolicy:
 
 
 POLICIES: dict[str, Callable[[MDP[Any]], ForeignPolicy]] = {"random": random, "zero": zero}
+
+
+def named(path: Path, mdp: MDP[Any]) -> ForeignPolicy | None:
+    """The reference policy of that name, unless there is a file or directory of that name."""
+    make = POLICIES.get(str(path))
+    return None if make is None or path.exists() else make(mdp)
 
 
 def rows(task: Task[Any]) -> dict[str, Any]:

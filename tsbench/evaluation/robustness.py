@@ -30,6 +30,11 @@ class Surface:
     phases: tuple[int, ...]
     survived: tuple[tuple[tuple[int, ...], ...], ...]
 
+    def __post_init__(self) -> None:
+        shape = (len(self.forces_N), len(self.headings_rad), len(self.phases))
+        if np.shape(self.survived) != shape:
+            raise ValueError("the surface of pushes does not fit its axes")
+
 
 @dataclass(frozen=True)
 class Robustness:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from functools import cache
 from pathlib import Path
 
@@ -16,6 +17,8 @@ _FOLDERS = (
     Path(__file__).parents[1] / "models",
     Path(__file__).parents[2] / "models",
 )
+
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.])")
 
 # Kinds of warnings after which mujoco resets a simulation in its midst.
 UNSTABLE = [
@@ -54,7 +57,14 @@ def compiled(name: str) -> mujoco.MjModel:
 
 
 def fingerprint(spec: mujoco.MjSpec) -> str:
-    """Hash of a task's physics: equal if and only if the compiled models are."""
+    """Hash of a task's MJCF with what the task adds to it: the same under every mujoco, though
+    one may centre a mesh at 0 and the next at 1e-15."""
+    text = _NUMBER.sub(lambda found: f"{round(float(found[0]), 9) + 0.0:g}", spec.to_xml())
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def compiled_hash(spec: mujoco.MjSpec) -> str:
+    """Hash of the compiled model, to the last bit; another mujoco compiles another."""
     model = spec.compile()
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)

@@ -8,7 +8,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import mujoco
@@ -17,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tsbench import curves
+from tsbench.evaluation.robustness import Surface
 from tsbench.viewer.recording import Array, Recording
 from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR, Band, Rgb
 
@@ -108,16 +108,16 @@ def joints(recording: Recording, plan: Recording) -> str:
     return _panels("joints", lines, columns=3)
 
 
-def robustness(surface: Mapping[str, Any], timestep: float) -> str:
+def robustness(surface: Surface, timestep: float) -> str:
     """The share of pushes that the robot survives, by force and direction and by force and when.
 
     Args:
-        surface: an `evaluation.robustness.Surface` as plain values.
+        surface: every push, and whether it was survived.
         timestep: seconds of a control step.
     """
-    survived = np.asarray(surface["survived"], float)
-    phases = [f"{phase * timestep:.2f}" for phase in surface["phases"]]
-    forces, headings = surface["forces_N"], np.degrees(surface["headings_rad"])
+    survived = np.asarray(surface.survived, float)
+    phases = [f"{phase * timestep:.2f}" for phase in surface.phases]
+    forces, headings = surface.forces_N, np.degrees(surface.headings_rad)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
         panels = figure.subplots(1, 2)

@@ -6,14 +6,14 @@ It needs nothing else to be opened: the 3-D view and all charts are inside.
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from tsbench import record, tables
 from tsbench.errors import TsbenchError
+from tsbench.evaluation.score import Score
 from tsbench.motion import Plan
 from tsbench.viewer import charts, page
 from tsbench.viewer.compose import foot_bands
@@ -24,7 +24,7 @@ from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words,
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
 
 
-def write_run_pages(directory: Path, score: Mapping[str, Any]) -> None:
+def write_run_pages(directory: Path, score: record.Record) -> None:
     """Writes a run's `view.html` and `report.html`, new files.
 
     Args:
@@ -62,7 +62,7 @@ def _pages(run: Subject, directory: Path) -> tuple[str, str]:
             "title": html.escape(run.title),
             "plan": page.css(PLAN_COLOUR),
             "executed": page.css(EXECUTED_COLOUR),
-            "answers": "".join(_answers(run.score, recording, plan)),
+            "answers": "".join(_answers(run.score.score, recording, plan)),
             "view": html.escape(view),
             "sections": "".join(_sections(run, directory, recording, plan)),
         },
@@ -70,28 +70,24 @@ def _pages(run: Subject, directory: Path) -> tuple[str, str]:
     return view, report
 
 
-def _answers(
-    score: Mapping[str, Any], recording: Recording, plan: Recording | None
-) -> Iterator[str]:
+def _answers(score: Score, recording: Recording, plan: Recording | None) -> Iterator[str]:
     planned = "Nothing: this method learns to act directly, without a plan."
     if plan is not None:
         planned = planned_in_words(plan) + " No physics binds it."
     for kind, title, text in (
         ("plan", "What was planned", planned),
         ("executed", "What was executed", executed_in_words(recording)),
-        ("score", "How good it is", _worth_in_words(score["score"])),
+        ("score", "How good it is", _worth_in_words(score)),
     ):
         yield f'<section class="{kind}"><h2>{title}</h2><p>{html.escape(text)}</p></section>'
 
 
-def _worth_in_words(score: Mapping[str, Any]) -> str:
-    perturbed = score["perturbed"]
-    episodes = perturbed["episodes"]
-    solved, spoiled = (round(perturbed[name] * episodes) for name in ("success", "violations"))
+def _worth_in_words(score: Score) -> str:
+    solved, spoiled = tables.counts(score.perturbed)
     return (
-        f"It earns {score['optimality']:.0%} of the reward of the best motion known under the "
-        f"planner's speed limits. From {episodes} starts a little different from the task's own "
-        f"it solves the task {solved} times, and falls or collides {spoiled} times."
+        f"It earns {score.optimality:.0%} of the reward of the best motion known under the "
+        f"planner's speed limits. From {score.perturbed.episodes} starts a little different from "
+        f"the task's own it solves the task {solved} times, and falls or collides {spoiled} times."
     )
 
 
@@ -121,13 +117,11 @@ def _sections(
             "square, at equal times.",
             charts.joints(recording, plan),
         )
-    robustness = run.score["score"].get("robustness")
-    if robustness:
-        yield _section(
-            "Robustness",
-            "Pushes on the robot's body: which it survives without a fall.",
-            charts.robustness(robustness["surface"], run.task.timestep),
-        )
+    yield _section(
+        "Robustness",
+        "Pushes on the robot's body: which it survives without a fall.",
+        charts.robustness(run.score.score.robustness.surface, run.task.timestep),
+    )
     metrics = directory / record.METRICS
     if learning := charts.learning(metrics) if metrics.exists() else None:
         yield _section(
@@ -152,11 +146,11 @@ def _agreement(recording: Recording) -> str:
 
 def _tables(run: Subject, directory: Path) -> Iterator[str]:
     assert run.score is not None
-    yield _table(_score_rows(run.score["score"]))
+    yield _table(_score_rows(run.score.score))
     costs = [
-        (stage["name"], f"{stage['steps']:,}", f"{stage['physics_substeps']:,}",
-         tables.duration(stage["seconds"]))
-        for stage in run.score["stages"]
+        (stage.name, f"{stage.steps:,}", f"{stage.physics_substeps:,}",
+         tables.duration(stage.seconds))
+        for stage in run.score.stages
     ]  # fmt: skip
     yield _table([("stage", "environment steps", "physics steps", "time"), *costs])
     path = directory / record.PLAN
@@ -172,14 +166,14 @@ def _tables(run: Subject, directory: Path) -> Iterator[str]:
         yield _table([("can physics follow the plan?", "measured", "allowed", ""), *items])
 
 
-def _score_rows(score: Mapping[str, Any]) -> Table:
-    own, perturbed = score["nominal"], score["perturbed"]
+def _score_rows(score: Score) -> Table:
+    own, perturbed = vars(score.nominal), vars(score.perturbed)
     rows = [("score", "task's own start", f"{perturbed['episodes']} other starts")]
     for name in own:
         if name != "episodes":
             label = name.replace("_", " ") + (", m" if name == "goal_distance" else "")
             rows.append((label, tables.number(own[name]), tables.number(perturbed[name])))
-    rows.append(("optimality", tables.number(score["optimality"]), ""))
+    rows.append(("optimality", tables.number(score.optimality), ""))
     return rows
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -37,7 +37,7 @@ class Subject:
     task: Task[Any]
     policy: Policy | None
     reference: ReferenceMotion | None
-    score: Mapping[str, Any] | None = None
+    score: record.Record | None = None
 
     def plan(self) -> Recording | None:
         return None if self.reference is None else record_motion(self.task, self.reference)
@@ -66,7 +66,7 @@ class Subject:
             plan,
             title=self.title,
             verdict=" ".join([*sentences, executed_in_words(recording)]),
-            summary=tables.summary(self.score) if self.score else (),
+            summary=tables.summary(self.score.score) if self.score else (),
         )
 
 
@@ -88,7 +88,7 @@ def task_subject(task: Task[Any]) -> Subject:
     return Subject(title, task, None, task.reference(naive_plan(task)))
 
 
-def run_subject(directory: Path, score: Mapping[str, Any] | None = None) -> Subject:
+def run_subject(directory: Path, score: record.Record | None = None) -> Subject:
     """A run.
 
     Args:

@@ -1,0 +1,104 @@
+"""What a score depends on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_info
+
+from tsbench.adapters import ForeignPolicy
+from tsbench.evaluation.protocol import Protocol
+from tsbench.mdp import Task
+from tsbench.policy import Policy
+from tsbench.sim.episodes import PolicyFunction
+from tsbench.sim.model import compiled_hash, fingerprint
+
+PACKAGES = ("mujoco", "numpy", "scipy", "tsbench")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a score depends on.
+
+    Attributes:
+        protocol: all of it, seed included.
+        task: its name.
+        task_version: of it.
+        mjcf: hash of the task's MJCF (`sim.model.fingerprint`).
+        model: hash of what mujoco compiled it to.
+        constants: sha256 of the values that define the task.
+        policy: sha256 of the policy file, or None where there is none.
+        packages: versions, Python's too.
+        machine: what chooses kernels: architecture, vector extensions, BLAS, C library.
+    """
+
+    protocol: Protocol
+    task: str
+    task_version: int
+    mjcf: str
+    model: str
+    constants: str
+    policy: str | None
+    packages: dict[str, str]
+    machine: dict[str, str]
+
+    @classmethod
+    def here(cls, task: Task[Any], protocol: Protocol, policy: PolicyFunction) -> Origin:
+        """Of a score that is made now, here."""
+        spec = task.spec()
+        return cls(
+            protocol=protocol,
+            task=task.name,
+            task_version=task.version,
+            mjcf=fingerprint(spec),
+            model=compiled_hash(spec),
+            constants=constants_hash(task),
+            policy=policy.sha256 if isinstance(policy, (Policy, ForeignPolicy)) else None,
+            packages={"python": platform.python_version()}
+            | {name: version(name) for name in PACKAGES},
+            machine=machine(),
+        )
+
+
+def machine() -> dict[str, str]:
+    """What decides which numerical kernels run here."""
+    extensions = np.show_config(mode="dicts")["SIMD Extensions"]
+    libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
+    first = libraries[0] if libraries else {}  # numpy's, which is loaded before any other
+    blas = [str(first.get(name)) for name in ("internal_api", "version", "architecture")]
+    return {
+        "architecture": platform.machine(),
+        "extensions": " ".join([*extensions["baseline"], *extensions["found"]]),
+        "blas": " ".join(blas),
+        "libc": " ".join(platform.libc_ver()),
+    }
+
+
+def constants_hash(task: Task[Any]) -> str:
+    """sha256 of a task's own constants and of the numbers that its file defines, but for those
+    named TRACKING_...: by the reward for imitating, nothing is judged."""
+    module = vars(sys.modules[type(task).__module__])
+    numbers = {
+        name: value
+        for name, value in module.items()
+        if name.isupper() and not name.startswith("TRACKING_") and _numeric(value)
+    }
+    content = json.dumps([task.constants(), numbers], sort_keys=True, default=_plain)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def _numeric(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(_numeric(part) for part in value)
+    return isinstance(value, (int, float, np.ndarray))
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else vars(value)
