@@ -55,6 +55,7 @@ SWING_HEIGHT = 0.10  # m (P)
 FALL_HEIGHT = 0.32  # m, of the centre of mass (P)
 GOAL_TOLERANCE = 0.05  # m (D)
 SUCCESS_SHARE = 0.2  # of the starting distance that may remain at the end (D)
+START_ANGLE, START_SPEED, START_SPIN = 0.05, 0.1, 0.2  # rad, m/s, rad/s (D)
 
 # s (D). The paper names both 0.1 s and 60 steps. At 0.1 s the reward, a product of exponentials
 # per step, prefers plans that throw all feet forward at once every few steps and slide
@@ -255,9 +256,9 @@ class Laikago(Task[LaikagoState]):
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """Standing at the origin in the nominal pose, at rest (P fixed, D pose).
 
-        Perturbed, all uniform (D): joints within 0.05 rad and 0.2 rad/s, base orientation within
-        0.05 rad per axis, base velocity within 0.1 m/s and 0.2 rad/s per axis. The base is raised
-        by what tilt and bend can lower a sole at most, so it may drop by some millimetres.
+        Perturbed, all uniform: joints and the base's orientation per axis within `START_ANGLE`,
+        the base's velocity within `START_SPEED`, angular velocities within `START_SPIN`. The base
+        is raised by what tilt and bend can lower a sole at most: it may drop by some millimetres.
         """
         qpos = np.tile(compiled("laikago").key("home").qpos, (count, 1))
         qvel = np.zeros((count, 18))
@@ -273,8 +274,8 @@ class Laikago(Task[LaikagoState]):
             return rng.uniform(-bound * scale, bound * scale, (len(qpos), size))
 
         qpos, qvel = qpos.copy(), qvel.copy()
-        turn = uniform(0.05, 3)
-        joints = uniform(0.05, 12)
+        turn = uniform(START_ANGLE, 3)
+        joints = uniform(START_ANGLE, 12)
         qpos[:, 7:] += joints
         # Small turns about the three axes, as one rotation vector.
         angle = np.linalg.norm(turn, axis=-1, keepdims=True)
@@ -285,9 +286,9 @@ class Laikago(Task[LaikagoState]):
         tilt = np.abs(turn[:, :2]) @ np.array([0.13, 0.22])
         bend = np.abs(joints.reshape(-1, 4, 3)[..., 1:]).max(axis=1) @ np.array([0.01, 0.16])
         qpos[:, 2] += tilt + bend
-        qvel[:, :3] += uniform(0.1, 3)
-        qvel[:, 3:6] += uniform(0.2, 3)
-        qvel[:, 6:] += uniform(0.2, 12)
+        qvel[:, :3] += uniform(START_SPEED, 3)
+        qvel[:, 3:6] += uniform(START_SPIN, 3)
+        qvel[:, 6:] += uniform(START_SPIN, 12)
         return qpos, qvel
 
     def control(self, state: LaikagoState, action: Array) -> tuple[Array, Array]:

@@ -61,6 +61,7 @@ DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
 MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
 HORIZON_RATIO = 1.5  # horizon over the planner's flight time: arrive, then hover (C)
 SUCCESS_DISTANCE, SUCCESS_SPEED = 1.0, 1.0  # m, m/s (D)
+START_SPREAD = (0.5, 0.5, 0.2)  # m, m, rad, and of the velocities the same per second (D)
 PUSHES = 16  # instants of the flight at which pushes are tried (D)
 
 
@@ -226,14 +227,12 @@ class Rocket(Task[RocketState]):
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """At the origin, at rest, upright (P).
 
-        Perturbed: position within 0.5 m and velocity within 0.5 m/s per axis, angle within
-        0.2 rad, angular velocity within 0.2 rad/s, all uniform (D).
+        Perturbed: position and angle, and their velocities, within `START_SPREAD`, uniform.
         """
         qpos, qvel = np.zeros((count, 3)), np.zeros((count, 3))
         if perturbed:
-            scale = np.array([0.5, 0.5, 0.2])
-            qpos = rng.uniform(-1.0, 1.0, (count, 3)) * scale
-            qvel = rng.uniform(-1.0, 1.0, (count, 3)) * scale
+            qpos = rng.uniform(-1.0, 1.0, (count, 3)) * START_SPREAD
+            qvel = rng.uniform(-1.0, 1.0, (count, 3)) * START_SPREAD
         return Start(np.zeros(count), qpos, qvel, np.zeros((count, 0)))
 
     def control(self, state: RocketState, action: Array) -> tuple[Array, Array]:
