@@ -33,7 +33,7 @@ class Surface:
     def __post_init__(self) -> None:
         shape = (len(self.forces_N), len(self.headings_rad), len(self.phases))
         if np.shape(self.survived) != shape:
-            raise ValueError("the surface of pushes does not fit its axes")
+            raise ValueError("survived does not fit forces_N, headings_rad and phases")
 
 
 @dataclass(frozen=True)
