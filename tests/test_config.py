@@ -149,7 +149,7 @@ def test_typed_builds_what_the_annotations_say() -> None:
         ({"inner": {"size": 3}, "rate": 10**400}, "rate must be a number, not 1000"),
         ({"inner": {"size": 3}, "rate": -1.0}, "rate must not be negative"),
         ({"inner": {"size": 3, "szie": 4}}, "unknown key in inner 'szie'; allowed: size"),
-        ([1], "the configuration must be key: value pairs, not [1]"),
+        ([1], "the content must be key: value pairs, not [1]"),
     ],
 )
 def test_typed_refuses_what_they_do_not(content: object, line: str) -> None:

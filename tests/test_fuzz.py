@@ -18,6 +18,7 @@ from tsbench import config, record, run, tables, tasks
 from tsbench.checkpoint import Checkpoints
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.evaluate import check_fit
+from tsbench.files import write_json
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.policy import Policy, PolicyInfo
 
@@ -89,7 +90,7 @@ def intact(
     ).save(folder)
     chosen = config.compose([f"task={NAME}", "budget=smoke"])
     (folder / "config.yaml").write_text(yaml.safe_dump(asdict(chosen)))
-    record.write_json(folder / "score.json", invented_record(NAME).as_dict())
+    write_json(folder / "score.json", invented_record(NAME).as_dict())
     Checkpoints(folder / "checkpoints", pytest.fail).save(0, "plan", 1, {"values": np.ones(3)})
     return folder
 

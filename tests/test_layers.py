@@ -22,7 +22,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "gl": {"errors"},
     "curves": {"errors"},
     "conf": set(),
-    "files": set(),
+    "files": {"errors"},
     "planning": {"errors"},
     "typed": {"errors"},
     "motion": {"errors", "files"},
@@ -50,7 +50,7 @@ MAY_KNOW: dict[str, set[str]] = {
         "errors", "files", "mdp", "motion", "policy", "problem", "sim", "tasks", "evaluation", "rl",
         "methods", "viewer", "config", "record", "tables", "workspace", "curves",
     },
-    "launch": {"errors", "config", "record", "run"},
+    "launch": {"errors", "files", "config", "record", "run"},
     "bench": {
         "errors", "mdp", "motion", "policy", "problem", "sim", "tasks", "rl", "methods", "config",
         "record", "workspace", "run",

@@ -25,6 +25,7 @@ from tsbench.evaluation.protocol import PROTOCOLS, SMOKE
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.policy import Policy
 from tsbench.record import Stage
+from tsbench.sim.model import compiled_hash, fingerprint
 from tsbench.workspace import RunWorkspace
 
 WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512", "seed=3"]
@@ -91,8 +92,9 @@ def test_versions_and_hashes(shown: tuple[Path, str]) -> None:
     content = json.loads((shown[0] / "versions.json").read_text())
     assert content["packages"]["mujoco"] == version("mujoco")
     assert content["packages"]["rsl-rl-lib"] == version("rsl-rl-lib")
-    policy = Policy.load(shown[0])
-    assert content["physics"] == {"rocket_navigation": policy.info.physics}
+    spec = tasks.make("rocket_navigation").spec()
+    assert content["physics"] == {"rocket_navigation": compiled_hash(spec)}
+    assert Policy.load(shown[0]).info.physics == fingerprint(spec)
 
 
 def test_the_score_says_what_each_stage_used(shown: tuple[Path, str]) -> None:
@@ -278,6 +280,7 @@ def plan_of_another_task(run: Path) -> None:
             lambda run: other_score(run, "score", "origin", "policy", value="0" * 64),
             "one mixes several runs: its files are not of one policy",
         ),
+        (lambda run: other_score(run, "standard", value=False), "changed constants"),
         (lambda run: (run / "versions.json").write_text("hi"), "damaged versions"),
     ],
 )

@@ -108,10 +108,10 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
             first = session.run(None, {name: observation[None].astype(kind)})[0]
         except Exception as error:  # as above
             raise TsbenchError(f"{path} cannot be run: {_line(error)}") from None
-        if np.ndim(first) != 2 or len(first) != 1:
-            raise TsbenchError(
-                f"{path} returns shape {np.shape(first)}, not (1, {mdp.action_size})"
-            )
+        shape = first.shape if isinstance(first, np.ndarray) else None
+        if shape is None or len(shape) != 2 or shape[0] != 1:
+            given = "no array" if shape is None else f"shape {shape}"
+            raise TsbenchError(f"{path} returns {given}, not (1, {mdp.action_size})")
         return first[0]
 
     return ForeignPolicy(

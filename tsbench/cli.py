@@ -174,7 +174,7 @@ def _list(words: Sequence[str]) -> None:
     parser = _parser("list")
     options = parser.parse_args(words)
     from tsbench import config, methods, tasks
-    from tsbench.record import write_json
+    from tsbench.files import write_json
 
     made = {name: tasks.make(name) for name in tasks.names()}
     budgets = {name: config.budgets(name) for name in made}
@@ -224,7 +224,7 @@ def _parser(verb: str, *, json: bool = True) -> Parser:
 
 def _new_file(word: str) -> Path:
     """A path that can be written: what took hours must not be lost at its end."""
-    from tsbench.record import check_new
+    from tsbench.files import check_new
 
     path = Path(word)
     check_new(path)
@@ -253,6 +253,7 @@ def _evaluate(words: Sequence[str]) -> int:
     from tsbench.evaluation.evaluate import evaluate
     from tsbench.evaluation.protocol import PROTOCOLS, V1
     from tsbench.evaluation.replay import compare
+    from tsbench.files import write_json
 
     path = Path(options.policy)
     policy, task = _policy(path, options.task, options.trust_sb3)
@@ -280,7 +281,7 @@ def _evaluate(words: Sequence[str]) -> int:
         shown = record.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
         line = f" {path / record.SCORE}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    record.write_json(options.json, shown)
+    write_json(options.json, shown)
     if agrees is False:
         if options.keep is not None:
             console.print(" not kept: the score is not what it was", highlight=False)
@@ -410,7 +411,7 @@ def _bench(words: Sequence[str]) -> None:
     options = parser.parse_args(words)
     from tsbench import bench
     from tsbench.bench import table
-    from tsbench.record import write_json
+    from tsbench.files import write_json
 
     progress = Console(stderr=True)
     findings = bench.measure(

@@ -21,7 +21,8 @@ from omegaconf import DictConfig
 from tsbench import config, run
 from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError
-from tsbench.record import LOG, read_score, shown, write_json
+from tsbench.files import write_json
+from tsbench.record import LOG, read_score, shown
 
 RUNS = Path("runs")
 LONGEST_NAME = 200  # characters; file systems allow 255 bytes

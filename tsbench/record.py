@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-import tempfile
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ from tsbench.config import RunConfig
 from tsbench.errors import TsbenchError, os_errors
 from tsbench.evaluation.protocol import Protocol
 from tsbench.evaluation.score import Score
-from tsbench.files import write_whole
+from tsbench.files import check_writable, write_json
 from tsbench.mdp import Task
 from tsbench.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.policy import Policy
@@ -127,7 +125,7 @@ def read_score(directory: Path) -> Record:
         json.dumps(values, allow_nan=False)  # raises where a number is not finite
         record: Record = typed(Record, values, "")
     except (ValueError, OverflowError, RecursionError, TsbenchError) as error:
-        raise TsbenchError(f"damaged score {path}: {error}") from None
+        raise TsbenchError(f"damaged score, or another version's, {path}: {error}") from None
     return record
 
 
@@ -184,9 +182,9 @@ def check_keep(run: Path, entry: Path, protocol: Protocol) -> None:
     if missing:
         raise TsbenchError(f"{run} is no finished two-stage run: it lacks {', '.join(missing)}")
     policy, task = read_policy(run)
-    if not tasks.standard(task):
-        raise TsbenchError(f"{run} was made with changed constants: it cannot be an entry")
     record = read_score(run)
+    if not (tasks.standard(task) and record.standard):
+        raise TsbenchError(f"{run} was made with changed constants: it cannot be an entry")
     read_versions(run)
     for what, here, there in (
         ("task", policy.info.task, record.task),
@@ -200,7 +198,7 @@ def check_keep(run: Path, entry: Path, protocol: Protocol) -> None:
         task.check_fit(motion)
     if entry.exists():
         raise TsbenchError(f"{entry} exists and nothing is overwritten")
-    _check_writable(entry, next(one for one in entry.absolute().parents if one.exists()))
+    check_writable(entry, next(one for one in entry.absolute().parents if one.exists()))
 
 
 def keep(run: Path, entry: Path, score: Score) -> None:
@@ -227,39 +225,3 @@ def shown(record: Record) -> dict[str, Any]:
     others (`standard`), and what its stages took."""
     values = record.as_dict()
     return {**values["score"], "standard": values["standard"], "stages": values["stages"]}
-
-
-def check_new(path: Path) -> None:
-    """
-    Raises:
-        TsbenchError: `write_json` could not write there, whatever the content.
-    """
-    if path.exists():
-        raise TsbenchError(f"{path} exists and nothing is overwritten")
-    _check_writable(path, path.parent)
-
-
-def _check_writable(path: Path, folder: Path) -> None:
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise TsbenchError(f"{path}: {error.strerror}") from None
-
-
-def write_json(path: Path | None, content: Any) -> None:
-    """Writes a JSON file, if one is asked for; nothing is overwritten.
-
-    Raises:
-        TsbenchError: the file exists or cannot be written.
-    """
-    if path is None:
-        return
-    check_new(path)
-    with os_errors(path):
-        write_whole(path, (_legible(json.dumps(content, indent=2)) + "\n").encode())
-
-
-def _legible(text: str) -> str:
-    """JSON with every list of plain values on one line."""
-    return re.sub(r"\[[^][{}\"]*\]", lambda found: " ".join(found[0].split()), text)

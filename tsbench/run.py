@@ -29,7 +29,7 @@ from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors,
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
-from tsbench.files import PART, write_whole
+from tsbench.files import PART, write_json, write_whole
 from tsbench.problem import Problem
 from tsbench.record import (
     ACTIONS,
@@ -46,10 +46,9 @@ from tsbench.record import (
     read_config,
     read_score,
     read_versions,
-    write_json,
 )
 from tsbench.rl.stages import KINDS, settings
-from tsbench.sim.model import fingerprint
+from tsbench.sim.model import compiled_hash
 from tsbench.viewer.report import write_run_pages
 from tsbench.workspace import RunWorkspace
 
@@ -334,7 +333,7 @@ def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
         "code": code.hexdigest(),
-        "physics": {problem.task.name: fingerprint(problem.task.spec())},
+        "physics": {problem.task.name: compiled_hash(problem.task.spec())},
     }
 
 

@@ -47,13 +47,13 @@ def typed(kind: Any, value: Any, path: str) -> Any:
     if type(value) is kind:
         return value
     wanted = _WORDS.get(kind) or _WORDS.get(origin) or str(kind)
-    raise TsbenchError(f"{path or 'the configuration'} must be {wanted}, not {value!r}")
+    raise TsbenchError(f"{path or 'the content'} must be {wanted}, not {value!r}")
 
 
 def typed_items(kind: type, value: Any, path: str) -> dict[str, Any]:
     """Those fields of a dataclass that are given, with their types. See `typed`."""
     if not isinstance(value, Mapping):
-        raise TsbenchError(f"{path or 'the configuration'} must be key: value pairs, not {value!r}")
+        raise TsbenchError(f"{path or 'the content'} must be key: value pairs, not {value!r}")
     hints = get_type_hints(kind)
     allowed = [entry.name for entry in fields(kind)]
     for name in value:

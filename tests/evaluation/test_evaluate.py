@@ -15,6 +15,7 @@ from tsbench import TsbenchError, tasks
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import SMOKE, Protocol
+from tsbench.evaluation.score import Summary
 from tsbench.policy import Policy, PolicyInfo
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import fingerprint
@@ -173,6 +174,16 @@ def test_success_needs_an_episode_without_violation() -> None:
 
 
 # What is reachable
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("episodes", 0), ("episodes", 10**400), ("success", 1.01), ("violations", -0.01)],
+)
+def test_a_summary_that_cannot_be(field: str, value: float) -> None:
+    summary = Summary(1, 0.5, 1.0, 0.0, 95.0, 0.1)
+    with pytest.raises(ValueError, match=field):
+        replace(summary, **{field: value})  # type: ignore[arg-type]
 
 
 def test_progress_rises_to_the_end() -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,6 +67,22 @@ def test_what_a_score_says_of_its_origin(score: Score) -> None:
     assert origin.machine["blas"].split()[0] in ("openblas", "mkl", "blis", "flexiblas", "None")
     assert len({origin.mjcf, origin.model, origin.constants}) == 3
     assert origin.policy is None  # a function has no file
+
+
+def test_a_machine_is_the_same_in_every_process() -> None:
+    """numpy and scipy bring a BLAS each, and they are found in no order."""
+    program = "import scipy.stats; from tsbench.evaluation.origin import machine; print(machine())"
+    told = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | {"PYTHONHASHSEED": str(seed)},
+        ).stdout.strip()
+        for seed in range(4)
+    }
+    assert told == {str(machine())}
 
 
 def test_the_constants_hash(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
+from tsbench.files import write_json
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.policy import Policy, PolicyInfo
-from tsbench.record import Record, write_json
+from tsbench.record import Record
 from tsbench.sim.model import fingerprint
 
 

@@ -71,7 +71,9 @@ def machine() -> dict[str, str]:
     """What decides which numerical kernels run here."""
     extensions = np.show_config(mode="dicts")["SIMD Extensions"]
     libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
-    first = libraries[0] if libraries else {}  # numpy's, which is loaded before any other
+    # scipy has one of its own; they come in no order.
+    libraries.sort(key=lambda one: ("numpy" not in one["filepath"], one["filepath"]))
+    first = libraries[0] if libraries else {}
     blas = [str(first.get(name)) for name in ("internal_api", "version", "architecture")]
     return {
         "architecture": platform.machine(),

@@ -64,7 +64,8 @@ class Protocol:
     claim: the one of them that the paper claims to be survived.
     duration: of the pushes in seconds.
     logged: perturbed episodes whose actions are kept, to replay the physics from.
-    tolerance: by which shares and normalized rewards may differ on another kind of machine.
+    tolerance: by which shares may differ on another kind of machine, and rewards as shares of the
+        best motion's.
     impulse_tolerance: the same for impulses, as a share.
     """
 

@@ -30,6 +30,13 @@ class Summary:
     steps: float
     goal_distance: float
 
+    def __post_init__(self) -> None:
+        if not 1 <= self.episodes < 2**31:
+            raise ValueError(f"episodes must be a count, not {self.episodes}")
+        for name in ("success", "violations"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+
 
 @dataclass(frozen=True)
 class Score:

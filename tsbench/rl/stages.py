@@ -41,7 +41,7 @@ def settings(problem: Problem, kind: str) -> StageSettings:
     disturb = changes.get("disturb", Disturbances())
     if kind == "plan" and disturb != Disturbances():
         raise TsbenchError("task.training.plan.disturb: planning has no physics to disturb")
-    if disturb.interval < problem.task.timestep:
+    if disturb != Disturbances() and disturb.interval < problem.task.timestep:
         step = f"a control step of {problem.task.timestep:.3g} s"
         raise TsbenchError(f"task.training.{kind}.disturb.interval must be at least {step}")
     try:
