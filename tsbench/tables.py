@@ -113,14 +113,22 @@ def run_title(record: Record) -> str:
 
 def summary(score: Score) -> list[tuple[str, str]]:
     """Labels and values of a score in short, in words that need no explanation."""
-    perturbed, robustness = score.perturbed, score.robustness
+    perturbed = score.perturbed
     solved, spoiled = counts(perturbed)
-    bound = "over " if robustness.impulse_50_is_lower_bound else ""
     return [
         ("of the largest possible reward", f"{score.normalized_reward:.1%}"),
         ("of the best motion at the planner's speed", f"{score.optimality:.1%}"),
         ("solved from other starts", f"{solved} of {perturbed.episodes}"),
         ("falls and collisions there", f"{spoiled} of {perturbed.episodes}"),
+        *pushes(score),
+    ]
+
+
+def pushes(score: Score) -> list[tuple[str, str]]:
+    """Labels and values of its robustness in short."""
+    robustness = score.robustness
+    bound = "over " if robustness.impulse_50_is_lower_bound else ""
+    return [
         (f"pushes of {claim_force(score):.3g} N survived", f"{robustness.survival_100N:.0%}"),
         ("impulse that half survive", f"{bound}{number(robustness.impulse_50)} N s"),
     ]

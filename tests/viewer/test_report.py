@@ -39,6 +39,7 @@ def test_a_report_says_what_was_planned_and_done_and_how_good_it_is(make_run: Ma
         "share of pushes survived",
         "environment steps",
         "<td>1:01</td>",
+        "<td>pushes of 100 N survived</td><td>25%</td>",
         "mean distance of CoM from support",
         "How it learned",
     ):

@@ -174,6 +174,7 @@ def _score_rows(score: Score) -> Table:
             label = name.replace("_", " ") + (", m" if name == "goal_distance" else "")
             rows.append((label, tables.number(own[name]), tables.number(perturbed[name])))
     rows.append(("optimality", tables.number(score.optimality), ""))
+    rows += [(label, value, "") for label, value in tables.pushes(score)]
     return rows
 
 
