@@ -210,10 +210,11 @@ class Learner:
                 for _ in range(self.settings.rollout):
                     actions = ppo.act(observation)
                     observation, rewards, dones, extras = env.step(actions)
-                    self._count(rewards, dones)
-                    ppo.process_env_step(
-                        observation, rewards, dones, extras if self.settings.bootstrap else {}
-                    )
+                    self._count(rewards, dones, extras["spared"])
+                    rewards += self._credit(extras["spared"])
+                    if not self.settings.bootstrap:
+                        del extras["time_outs"]
+                    ppo.process_env_step(observation, rewards, dones, extras)
                 ppo.compute_returns(observation)
             collected = time.perf_counter()
             losses = self._update()
@@ -275,9 +276,20 @@ class Learner:
             rate = s.learning_rate * (s.final_learning_rate / s.learning_rate) ** share
             self._ppo.learning_rate = rate
 
-    def _count(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
+    def _credit(self, spared: torch.Tensor) -> torch.Tensor:
+        """What perfect steps would earn, discounted, after the goal ended an episode: else hovering
+        just outside it would beat arriving, which is not how episodes are scored."""
+        s = self.settings
+        discount, left = s.discount**s.repeat, spared / s.repeat
+        if discount == 1.0:
+            return self.environment.mdp.max_reward * left
+        sums = discount * (1.0 - discount**left) / (1.0 - discount)
+        return self.environment.mdp.max_reward * sums
+
+    def _count(self, rewards: torch.Tensor, dones: torch.Tensor, spared: torch.Tensor) -> None:
         repeat = self.settings.repeat  # an episode's last hold counts in full
         self._return += rewards.numpy() * repeat
+        self._return += spared.numpy() * self.environment.mdp.max_reward
         self._length += repeat
         ended = np.flatnonzero(dones.numpy())
         self._returns.extend(self._return[ended].tolist())

@@ -49,23 +49,32 @@ class TorchEnvironment(VecEnv):
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """`repeat` steps; the reward is the mean of theirs, not the sum, which keeps values small.
         Of an episode that ends on the way the missing steps count as zero; the one that begins
-        waits for its first action with one of zeros. Extras: `time_outs`, whether an episode ended
-        with its last step, shape (num_envs,)."""
+        waits for its first action with one of zeros. Extras, each of shape (num_envs,):
+        `time_outs`, whether an episode ended with its last step; `spared`, how many steps one that
+        ended at its goal did not need."""
         held = actions.numpy().astype("float64")
         transition = self.environment.step(held)
         reward = transition.reward
         terminal, time_outs = transition.terminal, transition.truncated
+        spared = transition.spared
         for _ in range(self.repeat - 1):
             over = terminal | time_outs
             held[over] = 0.0
             transition = self.environment.step(held)
             reward = reward + np.where(over, 0.0, transition.reward)
+            spared = spared + np.where(over, 0, transition.spared)
             terminal = terminal | (transition.terminal & ~over)
             time_outs = time_outs | (transition.truncated & ~over)
         self._observation = self._tensors(transition.observation)
         rewards = torch.from_numpy(reward / self.repeat).float()
         dones = torch.from_numpy(terminal | time_outs).long()
-        return self._observation, rewards, dones, {"time_outs": torch.from_numpy(time_outs).float()}
+        extras = {"time_outs": time_outs, "spared": spared}
+        return (
+            self._observation,
+            rewards,
+            dones,
+            {name: torch.from_numpy(values).float() for name, values in extras.items()},
+        )
 
     def snapshot(self) -> dict[str, Any]:
         """The environment's, with the observation that the next action answers."""

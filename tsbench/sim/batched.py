@@ -211,6 +211,7 @@ class Transition(Generic[S]):
         truncated: the episode ended with its last step.
         ended: the rows of either kind of ending, shape (k,).
         final: the states that those episodes ended in, k of them.
+        spared: steps that an episode which ended at its goal did not need; they count as perfect.
     """
 
     observation: np.ndarray
@@ -219,6 +220,7 @@ class Transition(Generic[S]):
     truncated: np.ndarray
     ended: np.ndarray
     final: S
+    spared: np.ndarray
 
 
 class BatchedEnvironment(Generic[S]):
@@ -269,14 +271,18 @@ class BatchedEnvironment(Generic[S]):
         truncated = (self.steps >= self.mdp.horizon) & ~terminal
         ended = np.flatnonzero(terminal | truncated)
         final = state.rows(ended)
+        spared = np.zeros(self.count, int)
         if len(ended):
+            arrived = self.mdp.reached(final) & ~self.mdp.violated(final) & terminal[ended]
+            spared[ended] = np.where(arrived, self.mdp.horizon - self.steps[ended], 0)
+            spared[diverged] = 0
             fresh = self.dynamics.begin(self.rng, ended)
             self.steps[ended] = np.rint(fresh.time / self.mdp.timestep).astype(int)
             state = state.updated(ended, fresh)
         self.state = state
         observation = self.mdp.observation(state)
         self.seconds += perf_counter() - began
-        return Transition(observation, reward, terminal, truncated, ended, final)
+        return Transition(observation, reward, terminal, truncated, ended, final, spared)
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next step depends on, but for the action: plain values and arrays."""
