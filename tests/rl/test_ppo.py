@@ -253,6 +253,60 @@ def test_held_actions_are_counted_as_steps() -> None:
     assert taught._ppo.gamma == pytest.approx(0.729)
 
 
+@pytest.mark.parametrize(
+    ("discount", "repeat", "spared", "credit"),
+    [
+        (0.9, 1, 0.0, 0.0),
+        (0.9, 1, 2.0, 0.9 + 0.81),
+        (0.9, 2, 4.0, 0.81 + 0.6561),  # two decisions, of two steps each
+        (1.0, 1, 7.0, 7.0),
+    ],
+)
+def test_an_arrival_is_worth_what_perfect_steps_would_be(
+    discount: float, repeat: int, spared: float, credit: float
+) -> None:
+    near = Planning(tasks.make("laikago_walk", distance=0.3))
+    taught = learner(replace(TINY, discount=discount, repeat=repeat), subject=near)
+    found = taught._credit(torch.tensor([spared]))
+    np.testing.assert_allclose(found, [near.max_reward * credit], rtol=1e-6)
+
+
+def test_a_learner_is_told_of_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And its reports have the same return as a score: perfect steps after the goal."""
+    near = Planning(tasks.make("laikago_walk", distance=0.07))  # 2 cm to where the goal begins
+    taught = learner(replace(TINY, discount=0.9, bootstrap=False), subject=near)
+    told: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
+    earned: list[torch.Tensor] = []
+    step, process = taught._env.step, taught._ppo.process_env_step
+
+    def stepped(actions: torch.Tensor) -> Any:
+        given = step(actions)
+        earned.append(given[1].clone())
+        return given
+
+    def processed(
+        observation: Any, rewards: torch.Tensor, dones: torch.Tensor, extras: Any
+    ) -> None:
+        assert "time_outs" not in extras
+        told.append((rewards.clone(), dones, extras["spared"]))
+        process(observation, rewards, dones, extras)
+
+    monkeypatch.setattr(taught._env, "step", stepped)
+    monkeypatch.setattr(taught._ppo, "process_env_step", processed)
+    taught.learn(1024)
+    arrivals, returns, running = 0, [], np.zeros(8)
+    for own, (rewards, dones, spared) in zip(earned, told, strict=True):
+        credit = 0.9 * (1.0 - 0.9**spared) / 0.1
+        torch.testing.assert_close(rewards, own + credit)
+        assert not (spared > 0)[dones == 0].any()
+        arrivals += int((spared > 0).sum())
+        running += (own + near.max_reward * spared).numpy()
+        returns += running[dones == 1].tolist()
+        running[dones == 1] = 0.0
+    assert arrivals > 8
+    np.testing.assert_allclose(list(taught._returns), returns[-100:], rtol=1e-5)
+
+
 # Settings
 
 
