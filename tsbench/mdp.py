@@ -157,6 +157,13 @@ class MDP(ABC, Generic[S]):
         """Whether something happened that spoils the episode for good (a fall, a collision)."""
         return state.time < 0.0
 
+    def spared(self, state: S) -> np.ndarray:
+        """Steps that an episode which ends in this state does not need, since it is at its goal:
+        they count as perfect, else hovering just outside would beat arriving; shape (...,)."""
+        arrived = np.asarray(self.reached(state) & ~self.violated(state))
+        steps = np.rint(np.asarray(state.time) / self.timestep).astype(int)
+        return np.where(arrived, self.horizon - steps, 0)
+
 
 @dataclass(frozen=True)
 class Abstraction(Generic[S]):

@@ -65,6 +65,37 @@ def test_equal_to_the_dm_control_environment(
     assert ends >= (variant is None)
 
 
+def test_an_arrival_spares_steps() -> None:
+    """The hand-made planner goes to the goal, and then, in the next episode, nobody moves."""
+    coated = GymEnvironment(tsbench.load("laikago_walk", "planning", distance=0.07))
+    batched = GymVectorEnvironment(
+        tsbench.load_batched("laikago_walk", "planning", count=COUNT, distance=0.07)
+    )
+    planning = coated.single.task.mdp
+    coated.reset(seed=0)
+    batched.reset(seed=0)
+    arrivals: list[int] = []
+    length = 0
+    while len(arrivals) < 2:
+        action = np.zeros(planning.action_size)
+        if not arrivals:
+            action = planning.abstraction.naive(coated.single.task.state)[0]
+        _, _, terminated, truncated, info = coated.step(action)
+        *_, infos = batched.step(np.tile(action, (COUNT, 1)))
+        length += 1
+        assert bool(info) == (terminated or truncated)
+        if not info:
+            continue
+        assert info == {"spared": planning.horizon - length if terminated else 0}
+        assert infos["final_info"]["spared"][0] == info["spared"]
+        assert infos["final_info"]["_spared"][0]
+        arrivals.append(info["spared"])
+        coated.reset()
+        length = 0
+    assert arrivals[0] > 0
+    assert arrivals[1] == 0
+
+
 def test_the_last_step_truncates() -> None:
     """1.5 times the 15 planner's steps (of 0.05 s) to a goal 3 m away are 39 of 0.02 s."""
     coated = GymEnvironment(tsbench.load("rocket_navigation", distance=3.0))
@@ -133,6 +164,9 @@ def test_the_vector_environment_is_gymnasiums_own(name: str) -> None:
         if infos:
             seen += 1
             np.testing.assert_array_equal(infos["_final_obs"], expected_infos["_final_obs"])
+            assert set(infos["final_info"]) == set(expected_infos["final_info"])
+            for key, values in infos["final_info"].items():
+                np.testing.assert_array_equal(values, expected_infos["final_info"][key])
             for final, other in zip(infos["final_obs"], expected_infos["final_obs"], strict=True):
                 assert (final is None) == (other is None)
                 assert final is None or final.tobytes() == other.tobytes()

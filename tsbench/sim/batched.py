@@ -273,8 +273,7 @@ class BatchedEnvironment(Generic[S]):
         final = state.rows(ended)
         spared = np.zeros(self.count, int)
         if len(ended):
-            arrived = self.mdp.reached(final) & ~self.mdp.violated(final) & terminal[ended]
-            spared[ended] = np.where(arrived, self.mdp.horizon - self.steps[ended], 0)
+            spared[ended] = np.where(terminal[ended], self.mdp.spared(final), 0)
             spared[diverged] = 0
             fresh = self.dynamics.begin(self.rng, ended)
             self.steps[ended] = np.rint(fresh.time / self.mdp.timestep).astype(int)

@@ -1,6 +1,9 @@
 """Tasks and their variants as Gymnasium environments, one at a time or many at once.
 
 Both are thin coats over the environments that tsbench itself uses: the floats are the same.
+Who arrives at a goal that ends the episode is spared the remaining steps, and a score counts them
+as perfect ones. When an episode ends, `info["spared"]` says how many: to a learner that takes an
+arrival for an ending like a fall, hovering just outside the goal beats arriving.
 A task's spread of starts is drawn from `np_random`.
 """
 
@@ -33,8 +36,9 @@ def spaces(mdp: MDP[Any]) -> tuple[Box, Box]:
 class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """A dm_control environment of tsbench as a `gymnasium.Env`.
 
-    `terminated` is an ending for a reason other than the last step, `truncated` the last step. A
-    seed makes the episodes that follow those of `tsbench.load(..., seed=seed)`.
+    `terminated` is an ending for a reason other than the last step, `truncated` the last step.
+    At the end `info["spared"]` counts the steps that an arrival at the goal spares. A seed makes
+    the episodes that follow those of `tsbench.load(..., seed=seed)`.
 
     Attributes:
         single: the environment within.
@@ -68,7 +72,8 @@ class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         terminated = time_step.last() and time_step.discount == 0.0
         truncated = time_step.last() and not terminated
         observation = time_step.observation[FLAT_OBSERVATION_KEY]
-        return observation, time_step.reward, terminated, truncated, {}
+        info = {"spared": self.single.task.spared()} if time_step.last() else {}
+        return observation, time_step.reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """The model's first camera's picture, shape (480, 640, 3), or None without a mode."""
@@ -127,7 +132,8 @@ class GymVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 final[row] = observation
             ended = transition.terminal | transition.truncated
             infos = {"final_obs": final, "_final_obs": ended}
-            infos |= {"final_info": {}, "_final_info": ended.copy()}
+            spared = {"spared": transition.spared, "_spared": ended.copy()}
+            infos |= {"final_info": spared, "_final_info": ended.copy()}
         return (
             transition.observation,
             transition.reward,

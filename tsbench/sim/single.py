@@ -67,6 +67,11 @@ class Adapter(control.Task):
             return 0.0
         return 1.0 if self._steps >= self.mdp.horizon else None
 
+    def spared(self) -> int:
+        """Steps that the arrival which ended the episode spares (`MDP.spared`), else zero."""
+        ended = bool(self.mdp.terminal(self.state)[0])
+        return int(self.mdp.spared(self.state)[0]) if ended else 0
+
     def action_spec(self, physics: dm_mujoco.Physics) -> dm_env.specs.BoundedArray:
         return dm_env.specs.BoundedArray(
             (self.mdp.action_size,), np.float64, minimum=-1.0, maximum=1.0, name="action"
