@@ -32,7 +32,7 @@ def test_the_oracle_is_remade(name: str) -> None:
 def test_the_reference_policies_are_remade(name: str, policy: str) -> None:
     """With those pushes alone between which half of them are survived."""
     task, row = tasks.make(name), stored(name)["rows"][policy]
-    few = replace(V1, conditions=(), forces=(100.0, 150.0))
+    few = replace(V1, conditions=(), phases=8, forces=(100.0, 150.0))
     score = evaluate(POLICIES[policy](task), task, protocol=few, threads=1)
     assert score.normalized_reward == pytest.approx(row["normalized_reward"], rel=1e-9)
     assert score.optimality == pytest.approx(row["optimality"], rel=1e-9)
