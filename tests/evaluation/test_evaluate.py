@@ -182,8 +182,9 @@ def test_success_needs_an_episode_without_violation() -> None:
 )
 def test_a_summary_that_cannot_be(field: str, value: float) -> None:
     summary = Summary(1, 0.5, 1.0, 0.0, 95.0, 0.1)
+    changed: dict[str, Any] = {field: value}
     with pytest.raises(ValueError, match=field):
-        replace(summary, **{field: value})  # type: ignore[arg-type]
+        replace(summary, **changed)
 
 
 def test_progress_rises_to_the_end() -> None:
