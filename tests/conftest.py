@@ -22,6 +22,7 @@ from tsbench.evaluation.score import Score, Summary
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.record import Record, Stage
 from tsbench.sim.kinematic import naive_plan
+from tsbench.task import plannable
 
 # How fast a machine is, or how busy, is no property of the code.
 settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -35,7 +36,7 @@ def _naive_plan(name: str) -> Plan:
 
 @cache
 def _naive_reference(name: str) -> ReferenceMotion:
-    return tasks.make(name).reference(_naive_plan(name))
+    return plannable(tasks.make(name)).reference(_naive_plan(name))
 
 
 @pytest.fixture(name="naive_plan", scope="session")

@@ -16,45 +16,35 @@ import tsbench
 ROOT = Path(tsbench.__file__).parent
 
 # What each room may know, lowest first; a room is a package or a file beside the packages.
-# `problem` is what a method is given; `rl` and `methods` both stand on it.
+# What everyone may know, beside what stands before it in this list.
+CORE = (
+    "errors", "typed", "files", "arrays", "constants", "rotations", "drawing", "state", "motion",
+    "policy", "task", "problem",
+)  # fmt: skip
 MAY_KNOW: dict[str, set[str]] = {
-    "errors": set(),
+    **{module: set(CORE[:number]) for number, module in enumerate(CORE)},
     "gl": {"errors"},
     "curves": {"errors"},
     "conf": set(),
-    "files": {"errors"},
-    "planning": {"errors"},
-    "typed": {"errors"},
-    "motion": {"errors", "files"},
-    "policy": {"errors", "files", "typed"},
-    "mdp": {"motion", "errors"},
-    "problem": {"mdp"},
-    "checkpoint": {"files", "problem"},
-    "sim": {"errors", "motion", "mdp"},
-    "tasks": {"errors", "motion", "mdp", "sim", "planning"},
-    "adapters": {"errors", "mdp", "policy"},
-    "evaluation": {"errors", "motion", "mdp", "policy", "adapters", "sim", "tasks"},
-    "rl": {"errors", "typed", "mdp", "policy", "problem", "sim"},
-    "methods": {"errors", "typed", "motion", "mdp", "policy", "problem", "sim", "planning", "rl"},
-    "viewer": {
-        "errors", "files", "motion", "mdp", "policy", "sim", "tasks", "evaluation", "record",
-        "tables", "curves",
-    },
-    "config": {"errors", "typed", "problem"},
-    "record": {
-        "errors", "files", "typed", "motion", "mdp", "policy", "tasks", "evaluation", "config",
-    },
+    "planning": {*CORE},
+    "checkpoint": {*CORE},
+    "sim": {*CORE},
+    "tasks": {*CORE, "sim", "planning"},
+    "adapters": {*CORE},
+    "evaluation": {*CORE, "adapters", "sim", "tasks"},
+    "rl": {*CORE, "sim"},
+    "methods": {*CORE, "sim", "planning", "rl"},
+    "viewer": {*CORE, "sim", "tasks", "evaluation", "record", "tables", "curves"},
+    "config": {*CORE},
+    "record": {*CORE, "tasks", "evaluation", "config"},
     "tables": {"evaluation", "record"},
-    "workspace": {"errors", "typed", "problem", "checkpoint", "record", "tables"},
+    "workspace": {*CORE, "checkpoint", "record", "tables"},
     "run": {
-        "errors", "files", "mdp", "motion", "policy", "problem", "sim", "tasks", "evaluation", "rl",
-        "methods", "viewer", "config", "record", "tables", "workspace", "curves",
+        *CORE, "sim", "tasks", "evaluation", "rl", "methods", "viewer", "config", "record",
+        "tables", "workspace", "curves",
     },
-    "launch": {"errors", "files", "config", "record", "run"},
-    "bench": {
-        "errors", "mdp", "motion", "policy", "problem", "sim", "tasks", "rl", "methods", "config",
-        "record", "workspace", "run",
-    },
+    "launch": {*CORE, "config", "record", "run"},
+    "bench": {*CORE, "sim", "tasks", "rl", "methods", "config", "record", "workspace", "run"},
 }  # fmt: skip
 ROOFS = {"cli", "gym", "tsbench"}  # the commands and the public faces: they may know everything
 
@@ -67,7 +57,7 @@ ONLY_IN: dict[str, set[str]] = {
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},
     "dm_env": {"sim"},
-    "mujoco": {"mdp", "planning", "sim", "tasks", "viewer", "bench", "cli"},
+    "mujoco": {"task", "planning", "sim", "tasks", "viewer", "bench", "cli"},
     "safetensors": {"policy", "checkpoint"},
     "hydra": {"config", "launch"},
     "omegaconf": {"config", "launch"},

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from tsbench.errors import TsbenchError, os_errors, unknown
-from tsbench.mdp import MDP
 from tsbench.policy import Policy
+from tsbench.task import MDP
 
 ONNX_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # those with continuous actions

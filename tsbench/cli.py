@@ -354,15 +354,11 @@ def _view(words: Sequence[str]) -> None:
     if (options.what is None) == (options.compare is None):
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
     from tsbench.viewer import film, page, serve
-    from tsbench.viewer.pushes import parse_push
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
 
     def show(push: str | None) -> Show:
-        force = None if push is None else parse_push(push)
-        return (
-            pair(options.compare, force) if options.compare else subject(options.what).show(force)
-        )
+        return pair(options.compare, push) if options.compare else subject(options.what).show(push)
 
     shown = show(options.push)
     if options.html:

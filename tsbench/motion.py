@@ -7,12 +7,14 @@ import io
 import struct
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from tsbench.arrays import Array, array_namespace, step_of
 from tsbench.errors import TsbenchError
 from tsbench.files import write_whole
 
@@ -24,12 +26,15 @@ _DAMAGE = (
 )  # fmt: skip
 
 
+_ORIGIN = ("task", "task_version", "timestep")  # what every recording says of itself
+
+
 @dataclass(frozen=True)
 class _Recording:
     """Arrays over time with their origin, kept in one npz file that holds no code."""
 
     kind: ClassVar[str]
-    time_axes: ClassVar[dict[str, int]]  # array name -> its number of dimensions
+    dimensions: ClassVar[dict[str, int]]  # of each array, by its name
 
     task: str
     task_version: int
@@ -46,21 +51,31 @@ class _Recording:
                 return f"{name} must be {kind.__name__}, not {getattr(self, name)!r}"
         if not (np.isfinite(self.timestep) and self.timestep > 0.0):
             return f"the time step is {self.timestep}, it must be positive"
-        for name, ndim in self.time_axes.items():
+        for name, ndim in self.dimensions.items():
             array = getattr(self, name)
             if not isinstance(array, np.ndarray) or array.ndim != ndim:
                 return f"{name} must be an array of {ndim} dimensions"
-            if array.dtype != (bool if name == "contacts" else np.float64):
+            if array.dtype != np.float64:
                 return f"{name} is of type {array.dtype}"
-            if not np.all(np.isfinite(array)):
+        for name, array in self.arrays.items():
+            if array.dtype.kind == "f" and not np.all(np.isfinite(array)):
                 return f"{name} holds values that are not finite"
         return None
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of its arrays by name, time as their first axis."""
+        return {name: getattr(self, name) for name in self.dimensions}
 
     def save(self, path: Path | str) -> None:
         """Writes the recording; the file appears whole or not at all."""
         content = io.BytesIO()
-        np.savez_compressed(content, kind=self.kind, **dataclasses.asdict(self))
+        np.savez_compressed(content, allow_pickle=False, kind=self.kind, **self._content())
         write_whole(Path(path), content.getvalue())
+
+    def _content(self) -> dict[str, Any]:
+        """What the file holds, by name."""
+        return {**{name: getattr(self, name) for name in _ORIGIN}, **self.arrays}
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -73,14 +88,21 @@ class _Recording:
         found = str(content.pop("kind", "unknown"))
         if found != cls.kind:
             raise TsbenchError(f"{path} is not a {cls.kind} file (it says: {found})")
-        names = {field.name for field in dataclasses.fields(cls)}
-        if names != set(content):
-            differing = ", ".join(sorted(names ^ set(content)))
-            raise TsbenchError(f"damaged {cls.kind} file {path}: missing or unknown {differing}")
         try:
-            return cls(**{name: _plain(value) for name, value in content.items()})
+            return cls._from_content({name: _plain(value) for name, value in content.items()})
         except (TsbenchError, TypeError, ValueError, AttributeError) as error:
             raise TsbenchError(f"damaged {cls.kind} file {path}: {error}") from None
+
+    @classmethod
+    def _from_content(cls, content: dict[str, Any]) -> Self:
+        """
+        Raises:
+            TsbenchError: values are missing, unknown or wrong.
+        """
+        names = {field.name for field in dataclasses.fields(cls)}
+        if differing := names ^ set(content):
+            raise TsbenchError(f"missing or unknown {', '.join(sorted(differing))}")
+        return cls(**content)
 
 
 def _content(path: Path, kind: str) -> dict[str, np.ndarray]:
@@ -115,7 +137,7 @@ class Plan(_Recording):
     """
 
     kind: ClassVar[str] = "plan"
-    time_axes: ClassVar[dict[str, int]] = {"states": 2, "rewards": 1}
+    dimensions: ClassVar[dict[str, int]] = {"states": 2, "rewards": 1}
 
     states: np.ndarray
     rewards: np.ndarray
@@ -140,29 +162,46 @@ class ReferenceMotion(_Recording):
     Attributes:
         qpos: generalised positions, shape (T + 1, nq).
         qvel: generalised velocities by central differences, shape (T + 1, nv).
-        feet: foot centres in the world frame in metres, shape (T + 1, feet, 3).
-        contacts: the feet's scheduled contacts, shape (T + 1, feet).
-        com: whole-body centre of mass in the world frame in metres, shape (T + 1, 3).
+        tracked: what else the task's imitation reward compares, by name, each (T + 1, ...), of
+            numbers or booleans (`Plannable.tracked`).
     """
 
     kind: ClassVar[str] = "reference motion"
-    time_axes: ClassVar[dict[str, int]] = {
-        "qpos": 2, "qvel": 2, "feet": 3, "contacts": 2, "com": 2,
-    }  # fmt: skip
+    dimensions: ClassVar[dict[str, int]] = {"qpos": 2, "qvel": 2}
 
     qpos: np.ndarray
     qvel: np.ndarray
-    feet: np.ndarray
-    contacts: np.ndarray
-    com: np.ndarray
+    tracked: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def _problem(self) -> str | None:
+        for name, array in self.tracked.items():
+            if not isinstance(array, np.ndarray) or array.ndim < 1:
+                return f"{name} must be an array over time"
+            if array.dtype not in (np.float64, np.bool_):
+                return f"{name} is of type {array.dtype}"
         if problem := super()._problem():
             return problem
-        lengths = {name: len(getattr(self, name)) for name in self.time_axes}
+        lengths = {name: len(array) for name, array in self.arrays.items()}
         if len(set(lengths.values())) != 1 or lengths["qpos"] < 2:
             return f"the lengths do not match: {lengths}"
         return None
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {**super().arrays, **self.tracked}
+
+    def _content(self) -> dict[str, Any]:
+        return {**super()._content(), "tracked": np.array(sorted(self.tracked), np.str_)}
+
+    @classmethod
+    def _from_content(cls, content: dict[str, Any]) -> Self:
+        named = content.pop("tracked", None)
+        if not isinstance(named, np.ndarray) or named.dtype.kind != "U" or named.ndim != 1:
+            raise TsbenchError("missing the names of what is tracked")
+        tracked = {name: content.pop(name) for name in named.tolist() if name in content}
+        if missing := set(named.tolist()) - tracked.keys():
+            raise TsbenchError(f"missing or unknown {', '.join(sorted(missing))}")
+        return super()._from_content({**content, "tracked": tracked})
 
     @property
     def steps(self) -> int:
@@ -173,9 +212,14 @@ class ReferenceMotion(_Recording):
         """Seconds."""
         return self.steps * self.timestep
 
-    def frame(self, time: np.ndarray) -> np.ndarray:
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds of each frame, shape (T + 1,)."""
+        return np.arange(self.steps + 1) * self.timestep
+
+    def frame(self, time: Array) -> Array:
         """Index of the frame at each time in seconds; the last one beyond the end."""
-        return np.clip(np.rint(time / self.timestep).astype(int), 0, self.steps)
+        return array_namespace(time).clip(step_of(time, self.timestep), 0, self.steps)
 
 
 def read_motion(path: Path | str) -> Plan | ReferenceMotion:
@@ -198,7 +242,7 @@ class ActionLog(_Recording):
     """
 
     kind: ClassVar[str] = "action log"
-    time_axes: ClassVar[dict[str, int]] = {"actions": 3, "rewards": 2}
+    dimensions: ClassVar[dict[str, int]] = {"actions": 3, "rewards": 2}
 
     actions: np.ndarray
     rewards: np.ndarray

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from tsbench.mdp import Task
+from tsbench.task import Task
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from tsbench.errors import TsbenchError, os_errors
 from tsbench.evaluation.protocol import Protocol
 from tsbench.evaluation.score import Score
 from tsbench.files import check_writable, write_json
-from tsbench.mdp import Task
 from tsbench.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.policy import Policy
+from tsbench.task import Task, plannable
 from tsbench.typed import typed
 
 CONFIG = "config.yaml"
@@ -195,7 +195,7 @@ def check_keep(run: Path, entry: Path, protocol: Protocol) -> None:
         if here != there:
             raise TsbenchError(f"{run} mixes several runs: its files are not of one {what}")
     for motion in (Plan.load(run / PLAN), ReferenceMotion.load(run / REFERENCE)):
-        task.check_fit(motion)
+        plannable(task).check_fit(motion)
     if entry.exists():
         raise TsbenchError(f"{entry} exists and nothing is overwritten")
     check_writable(entry, next(one for one in entry.absolute().parents if one.exists()))

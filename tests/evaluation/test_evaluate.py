@@ -19,6 +19,7 @@ from tsbench.evaluation.score import Summary
 from tsbench.policy import Policy, PolicyInfo
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import fingerprint
+from tsbench.task import plannable
 from tsbench.tasks.laikago import LaikagoState
 from tsbench.tasks.rocket import Rocket, RocketState
 
@@ -164,8 +165,8 @@ def test_success_needs_an_episode_without_violation() -> None:
         def violated(self, state: RocketState) -> Any:
             return state.position[..., 0] > 20.0
 
-    task = tasks.make("rocket_navigation")
-    harsh = Harsh(**task.constants())
+    task = cast(Rocket, tasks.make("rocket_navigation"))
+    harsh = Harsh(task.name, task.distance, task.obstacles, task.horizon)
     score = evaluate(pilot, harsh, protocol=few(2), threads=1)
     assert score.nominal.goal_distance < 1.0
     assert score.success == score.perturbed.success == 0.0
@@ -235,7 +236,7 @@ def test_best_return_of_a_gait_by_hand(
 def test_ideal_obeys_the_speed_limits(name: str) -> None:
     task = tasks.make(name)
     ideal = task.ideal()
-    start = task.abstraction().start(1)
+    start = plannable(task).abstraction().start(1)
     assert len(ideal.time) == task.horizon + 1
     np.testing.assert_allclose(ideal.time, np.arange(task.horizon + 1) * task.timestep)
     assert task.goal_distance(ideal)[0] == pytest.approx(task.goal_distance(start)[0])
@@ -267,7 +268,7 @@ def test_ideal_obeys_the_speed_limits(name: str) -> None:
 def test_nothing_planned_beats_the_ideal(name: str) -> None:
     """Random plans under the same limits get less than it."""
     task = tasks.make(name)
-    abstraction = task.abstraction()
+    abstraction = plannable(task).abstraction()
     rng = np.random.default_rng(0)
     state = abstraction.start(50)
     total = np.zeros(50)

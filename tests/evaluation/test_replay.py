@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.replay import compare, differences, replay
 from tsbench.evaluation.score import Score
 from tsbench.motion import ActionLog
+from tsbench.tasks import laikago, rocket
 from tsbench.typed import typed
 
 PROTOCOL = replace(SMOKE, perturbed=3, logged=2, conditions=SMOKE.conditions[:1], forces=(100.0,))
@@ -86,22 +87,21 @@ def test_a_machine_is_the_same_in_every_process() -> None:
 
 
 def test_the_constants_hash(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It changes with the task's own constants and with the numbers in its file that a score
-    depends on."""
+    """It changes with every value that a task says decides its scores, and with nothing else."""
     before = constants_hash(TASK)
     assert before == constants_hash(tasks.make("laikago_trot", distance=0.4))
     assert before != constants_hash(tasks.make("laikago_trot"))
     assert before != constants_hash(tasks.make("laikago_walk", distance=0.4))
-    for name, value in (("SLIP_DECAY", -11.0), ("FILTER_B", (0.1, 0.2, 0.1))):
-        with monkeypatch.context() as changed:
-            changed.setattr(f"tsbench.tasks.laikago.{name}", value)
-            assert before != constants_hash(TASK)
-    rocket = tasks.make("rocket_navigation")
-    before = constants_hash(rocket)
-    monkeypatch.setattr("tsbench.tasks.rocket.TRACKING_DECAY", -1.0)
-    assert before == constants_hash(rocket)
-    monkeypatch.setattr("tsbench.tasks.rocket.DEAD_ZONE", 0.4)
-    assert before != constants_hash(rocket)
+    for module, task in ((laikago, TASK), (rocket, tasks.make("rocket_obstacles"))):
+        before = constants_hash(task)
+        for field in fields(module.C):
+            value = getattr(module.C, field.name)
+            other = (*value[::-1], 7.0) if isinstance(value, tuple) else value * 1.01
+            with monkeypatch.context() as changed:
+                changed.setattr(module, "C", replace(module.C, **{field.name: other}))
+                assert before != constants_hash(task), field.name
+    monkeypatch.setattr(rocket, "TRACKING_DECAY", -1.0)
+    assert before == constants_hash(tasks.make("rocket_obstacles"))
 
 
 def test_bit_for_bit(score: Score, log: ActionLog) -> None:

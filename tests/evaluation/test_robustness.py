@@ -21,12 +21,13 @@ from tsbench.evaluation.robustness import (
     survival,
     wilson,
 )
-from tsbench.mdp import State, Task
 from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.push import Push
 from tsbench.sim.single import environment
+from tsbench.state import State
+from tsbench.task import Task
 
 NONE = Condition("as it is")
 

@@ -21,6 +21,7 @@ from tsbench.policy import Policy, PolicyInfo
 from tsbench.problem import Budget, Problem, Snapshot
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
+from tsbench.task import plannable
 
 ENVIRONMENTS, ROLLOUT = 8, 8
 TRAINING = {
@@ -85,7 +86,7 @@ def bits(policy: Policy) -> bytes:
 def test_twostage(name: str, tmp_path: Path) -> None:
     desk, given = Desk(tmp_path), problem(name, name="twostage")
     policy = methods.find("twostage").train(given, desk)
-    task = given.task
+    task = plannable(given.task)
     assert desk.stages == [("plan", 192), ("imitate", 128)]
     assert desk.reports == {"plan": [64, 128, 192], "imitate": [64, 128]}
     assert desk.substeps == {"plan": 0, "imitate": 128 * task.substeps}

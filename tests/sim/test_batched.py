@@ -11,12 +11,13 @@ import pytest
 
 import tsbench
 from tsbench import tasks
-from tsbench.mdp import Start, State, Task
 from tsbench.motion import ReferenceMotion
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
+from tsbench.state import Start, State
+from tsbench.task import SimulatedTask
 
 ROWS = 3
 Actions = Callable[[np.random.Generator, int, int], np.ndarray]
@@ -26,7 +27,7 @@ Actions = Callable[[np.random.Generator, int, int], np.ndarray]
 class Placed:
     """A task whose episodes begin where the test says."""
 
-    task: Task[Any]
+    task: SimulatedTask[Any]
     starts: Start
 
     def start(self, rng: np.random.Generator, count: int, *, perturbed: bool = False) -> Start:
@@ -48,7 +49,7 @@ def same(first: State, second: State) -> bool:
 
 
 def play_batched(
-    task: Task[Any], starts: Start, actions: np.ndarray, threads: int = 1
+    task: SimulatedTask[Any], starts: Start, actions: np.ndarray, threads: int = 1
 ) -> tuple[list[Any], np.ndarray]:
     """The states (T + 1) and rewards (T, rows) that `actions` (T, rows, a) lead to."""
     physics = Physics(task, len(starts.time), threads=threads)
@@ -60,7 +61,7 @@ def play_batched(
     return states, np.array(rewards)
 
 
-def compare(task: Task[Any], starts: Start, actions: np.ndarray) -> list[int]:
+def compare(task: SimulatedTask[Any], starts: Start, actions: np.ndarray) -> list[int]:
     """Plays `actions` (T, rows, a) both ways from `starts`; the steps at which episodes end."""
     states, rewards = play_batched(task, starts, actions, threads=2)
     observations = [task.observation(state) for state in states]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.mdp import State
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
+from tsbench.state import State
 
 NAMES = ("laikago_trot", "rocket_navigation")
 

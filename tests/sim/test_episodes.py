@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsbench.mdp import MDP, Array, State
+from tsbench.arrays import Array
 from tsbench.sim.episodes import Episodes, play
+from tsbench.state import State
+from tsbench.task import MDP
 
 HORIZON = 10
 
@@ -98,7 +100,7 @@ def test_one_episode(
 ) -> None:
     episodes = walk([start], [speed])
     assert episodes.lengths.tolist() == [length]
-    assert episodes.reached.tolist() == [reached]
+    assert episodes.spared.tolist() == [10 - length if reached else 0]
     assert episodes.violated.tolist() == [violated]
     assert episodes.returns.tolist() == pytest.approx([total])
     assert episodes.normalized.tolist() == pytest.approx([total / 20.0])  # 2 x 10 steps
@@ -112,7 +114,7 @@ def test_many_side_by_side() -> None:
     together = walk(starts, speeds, record=lambda state: state.x)
     for index, (start, speed) in enumerate(zip(starts, speeds, strict=True)):
         alone = walk([start], [speed])
-        for name in ("returns", "lengths", "reached", "violated", "normalized"):
+        for name in ("returns", "lengths", "spared", "violated", "normalized"):
             assert getattr(together, name)[index] == getattr(alone, name)[0]
         np.testing.assert_array_equal(together.rewards[:, index], alone.rewards[:, 0])
         np.testing.assert_array_equal(together.actions[:, index], alone.actions[:, 0])

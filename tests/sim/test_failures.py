@@ -12,10 +12,11 @@ import pytest
 
 from tsbench import tasks
 from tsbench.errors import NotFiniteError, TsbenchError
-from tsbench.mdp import Start, State, Task
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.episodes import play
 from tsbench.sim.single import environment
+from tsbench.state import Start, State
+from tsbench.task import Task
 
 STILL = np.zeros((3, 12))
 
@@ -25,7 +26,7 @@ class Altered:
 
     def __init__(self, task: Task[Any], **changes: Any) -> None:
         self.task = task
-        vars(self).update(changes)
+        vars(self).update({"plant": self, **changes})
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.task, name)
@@ -96,7 +97,7 @@ def test_a_diverged_episode_is_scored_as_a_failure(task: Task[Any]) -> None:
     episodes = play(task, Physics(wild, 3, threads=1), lambda o: np.zeros((len(o), 12)), 3, 0)
     assert episodes.diverged.tolist() == [False, True, False]
     assert episodes.violated[1]
-    assert not episodes.reached[1]
+    assert not episodes.spared[1]
     assert episodes.lengths[1] == 1
     assert episodes.lengths[0] == episodes.lengths[2] > 10
     assert episodes.returns[1] == 0.0 < episodes.returns[0]

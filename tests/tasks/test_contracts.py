@@ -99,7 +99,7 @@ def test_identity(case: Case) -> None:
     if case.variant != "planning":  # same observations, actions and physics
         assert subject.observation_size == task.observation_size
         assert subject.action_size == task.action_size
-        assert (subject.timestep, subject.substeps) == (task.timestep, task.substeps)
+        assert (subject.timestep, subject.plant) == (task.timestep, task)
 
 
 def test_time_passes_as_it_says(case: Case) -> None:

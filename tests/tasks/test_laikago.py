@@ -12,13 +12,13 @@ import pytest
 from scipy.signal import butter, freqz, lfilter
 from scipy.spatial.transform import Rotation
 
-from tsbench import TsbenchError, tasks
-from tsbench.mdp import Start
+from tsbench import TsbenchError, rotations, tasks
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.sim.batched import Physics
 from tsbench.sim.model import compiled
+from tsbench.state import Start
 from tsbench.tasks import laikago
-from tsbench.tasks.laikago import Laikago, LaikagoState, reference_times
+from tsbench.tasks.laikago import Laikago, LaikagoState
 
 GAITS = ("laikago_walk", "laikago_trot")
 SOLE = 0.0265  # m, from a foot's centre down
@@ -337,8 +337,8 @@ NOMINAL = np.array([0.0, 0.67, -1.33] * 4)
 
 def test_filter_is_a_butterworth_low_pass() -> None:
     b, a = butter(2, 4.0, fs=30.0)
-    np.testing.assert_allclose(laikago.FILTER_B, b, rtol=1e-12)
-    np.testing.assert_allclose([1.0, *laikago.FILTER_A], a, rtol=1e-12)
+    np.testing.assert_allclose(laikago.C.filter_b, b, rtol=1e-12)
+    np.testing.assert_allclose([1.0, *laikago.C.filter_a], a, rtol=1e-12)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 12))
     expected = NOMINAL + lfilter(b, a, 0.75 * actions, axis=0)
     np.testing.assert_allclose(controls(actions), expected, atol=1e-12)
@@ -346,7 +346,7 @@ def test_filter_is_a_butterworth_low_pass() -> None:
 
 def test_filter_response() -> None:
     """Gain 1 at rest and 1 / sqrt(2), which is -3 dB, at 4 Hz."""
-    _, response = freqz(laikago.FILTER_B, [1.0, *laikago.FILTER_A], worN=[0.0, 4.0], fs=30.0)
+    _, response = freqz(laikago.C.filter_b, [1.0, *laikago.C.filter_a], worN=[0.0, 4.0], fs=30.0)
     np.testing.assert_allclose(np.abs(response), [1.0, 0.7071068], rtol=1e-6)
     time = np.arange(300) / 30
     wave = np.tile(np.sin(2 * np.pi * 4.0 * time)[:, None], (1, 12))
@@ -415,22 +415,22 @@ def test_reference_of_the_naive_plan(
     task, plan, reference = make(name), naive_plan(name), naive_reference(name)
     times = np.arange(reference.steps + 1) * STEP
     assert times[-1] == pytest.approx(plan.times[-1])
-    np.testing.assert_array_equal(reference.contacts, task.gait.contacts(times))
+    np.testing.assert_array_equal(reference.tracked["contacts"], task.gait.contacts(times))
     # The base goes straight ahead at top speed, once the feet have left their hips' sides.
     speed = task.gait.base_speed
     np.testing.assert_allclose(reference.qpos[:, 0], speed * times, atol=0.03)
     np.testing.assert_allclose(reference.qpos[:, 1:3], [[0.0, 0.42]] * len(times), atol=1e-3)
     np.testing.assert_allclose(reference.qvel[60:, 0], speed, atol=1e-9)
     # Feet rest in stance, and in swing rise in a half sine of 10 cm and go forward.
-    soles = reference.feet[..., 2] - SOLE
-    assert np.abs(soles[reference.contacts]).max() < 2e-4
-    steps = np.diff(reference.feet[..., 0], axis=0)
-    stance = reference.contacts[1:] & reference.contacts[:-1]
+    soles = reference.tracked["feet"][..., 2] - SOLE
+    assert np.abs(soles[reference.tracked["contacts"]]).max() < 2e-4
+    steps = np.diff(reference.tracked["feet"][..., 0], axis=0)
+    stance = reference.tracked["contacts"][1:] & reference.tracked["contacts"][:-1]
     assert np.abs(steps[stance]).max() < 3e-4
     assert steps[~stance].min() > -3e-4
     share = (task.gait.phase(times) - task.gait.duty) / (1.0 - task.gait.duty)
     wanted = 0.1 * np.sin(np.pi * np.clip(share, 0.0, 1.0))
-    assert np.abs(soles - wanted)[~reference.contacts].max() < 2e-4
+    assert np.abs(soles - wanted)[~reference.tracked["contacts"]].max() < 2e-4
     # The feet are those of the pose, and velocities are central differences.
     joints = reference.qpos[:, 7:]
     np.testing.assert_allclose(
@@ -441,8 +441,8 @@ def test_reference_of_the_naive_plan(
     posed = physics.place(
         np.arange(len(times)), Start(times, reference.qpos, reference.qvel, memory)
     )
-    np.testing.assert_allclose(posed.feet, reference.feet, atol=1e-9)
-    np.testing.assert_allclose(posed.com, reference.com, atol=1e-9)
+    np.testing.assert_allclose(posed.feet, reference.tracked["feet"], atol=1e-9)
+    np.testing.assert_allclose(posed.com, reference.tracked["com"], atol=1e-9)
     low, high = compiled("laikago").jnt_range[1:].T
     assert np.all((joints > low) & (joints < high))
 
@@ -455,15 +455,15 @@ def test_a_swing_by_hand(
     It starts under its hip. Then it stands until frame 16 where the plan lets it stand.
     """
     plan, reference = naive_plan("laikago_trot"), naive_reference("laikago_trot")
-    planned = np.interp(reference_times(reference), plan.times, plan.states[:, 3 + 3 * FL])
+    planned = np.interp(reference.times, plan.times, plan.states[:, 3 + 3 * FL])
     touchdown = planned[8]
     assert touchdown > 0.35
     np.testing.assert_allclose(planned[8:17], touchdown, atol=1e-9)
     # Eased as s^2 (3 - 2 s) = 2.5 / 16, raised by 0.1 sin(45 degrees).
     quarter = 0.21935 + 0.15625 * (touchdown - 0.21935)
     expected = [quarter, 0.1245, SOLE + 0.0707107]
-    np.testing.assert_allclose(reference.feet[2, FL], expected, atol=2e-4)
-    np.testing.assert_allclose(reference.feet[8:17, FL, 0], touchdown, atol=2e-4)
+    np.testing.assert_allclose(reference.tracked["feet"][2, FL], expected, atol=2e-4)
+    np.testing.assert_allclose(reference.tracked["feet"][8:17, FL, 0], touchdown, atol=2e-4)
 
 
 @pytest.mark.parametrize("name", GAITS)
@@ -486,10 +486,15 @@ def _bent(plan: Plan, reference: ReferenceMotion) -> tuple[Plan, ReferenceMotion
     return plan, replace(reference, qpos=qpos)
 
 
+def offset(reference: ReferenceMotion, name: str, by: float) -> ReferenceMotion:
+    tracked = {**reference.tracked, name: reference.tracked[name] + by}
+    return replace(reference, tracked=tracked)
+
+
 def _flat(plan: Plan, reference: ReferenceMotion) -> tuple[Plan, ReferenceMotion]:
-    feet = reference.feet.copy()
+    feet = reference.tracked["feet"].copy()
     feet[:, RR, 2] = SOLE
-    return plan, replace(reference, feet=feet)
+    return plan, replace(reference, tracked={**reference.tracked, "feet": feet})
 
 
 @pytest.mark.parametrize(
@@ -500,9 +505,9 @@ def _flat(plan: Plan, reference: ReferenceMotion) -> tuple[Plan, ReferenceMotion
         (_slipping, "mean slip of a foot in stance"),
         (_bent, "joint angle beyond its limit"),
         (lambda p, r: (p, replace(r, qvel=3.0 * r.qvel)), "joint speed"),
-        (lambda p, r: (p, replace(r, feet=r.feet + 0.003)), "inverse kinematics error"),
+        (lambda p, r: (p, offset(r, "feet", 0.003)), "inverse kinematics error"),
         (_flat, "missing swing clearance"),
-        (lambda p, r: (p, replace(r, com=r.com + 0.2)), "mean distance of CoM from support"),
+        (lambda p, r: (p, offset(r, "com", 0.2)), "mean distance of CoM from support"),
     ],
 )  # fmt: skip
 def test_audit_finds_what_is_wrong(
@@ -588,11 +593,11 @@ def test_a_turned_robot_loses_only_its_orientation(
     qpos = reference.qpos[40].copy()
     qpos[3:7] = [math.cos(0.1), 0.0, 0.0, math.sin(0.1)]
     at = on_reference(task, reference, 40, qpos)
-    at = at.replace(com=reference.com[[40]])
+    at = at.replace(com=reference.tracked["com"][[40]])
     assert tracked(task, reference, at) == pytest.approx(0.65 * 0.9231163 + 0.35)
     # Roll is not heading: it also shows in the feet.
     qpos[3:7] = [math.cos(0.1), math.sin(0.1), 0.0, 0.0]
-    rolled = on_reference(task, reference, 40, qpos).replace(com=reference.com[[40]])
+    rolled = on_reference(task, reference, 40, qpos).replace(com=reference.tracked["com"][[40]])
     assert tracked(task, reference, rolled) < 0.65 * 0.9231163 + 0.33
 
 
@@ -646,15 +651,15 @@ def test_rotations() -> None:
     rng = np.random.default_rng(0)
     first, second = Rotation.random(50, rng=rng), Rotation.random(50, rng=rng)
     p, q = (rotation.as_quat(scalar_first=True) for rotation in (first, second))
-    product = Rotation.from_quat(laikago.multiply(p, q), scalar_first=True)
+    product = Rotation.from_quat(rotations.multiply(p, q), scalar_first=True)
     np.testing.assert_allclose(product.as_matrix(), (first * second).as_matrix(), atol=1e-12)
     angle = (first.inv() * second).magnitude()
-    np.testing.assert_allclose(laikago.angle_between(p, q), angle, atol=1e-7)
-    np.testing.assert_allclose(laikago.angle_between(p, -q), angle, atol=1e-7)
-    np.testing.assert_allclose(laikago.upward(p), first.as_matrix()[:, 2, 2], atol=1e-12)
+    np.testing.assert_allclose(rotations.angle_between(p, q), angle, atol=1e-7)
+    np.testing.assert_allclose(rotations.angle_between(p, -q), angle, atol=1e-7)
+    np.testing.assert_allclose(rotations.upward(p), first.as_matrix()[:, 2, 2], atol=1e-12)
     # In the heading frame the base's own x axis has no y component.
     forward = first.as_matrix()[:, None, :, 0]
-    heading = laikago.to_heading(forward, p)[:, 0]
+    heading = rotations.to_heading(forward, p)[:, 0]
     np.testing.assert_allclose(heading[:, 1], 0.0, atol=1e-12)
     assert np.all(heading[:, 0] >= 0.0)
     np.testing.assert_allclose(heading[:, 2], forward[:, 0, 2], atol=1e-12)

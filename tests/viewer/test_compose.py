@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
+from tsbench.drawing import Drawing
 from tsbench.errors import TsbenchError
-from tsbench.mdp import Drawing
 from tsbench.motion import ReferenceMotion
 from tsbench.viewer.compose import compose, compose_pair, compose_plan, spans
 from tsbench.viewer.pushes import parse_push
@@ -21,7 +21,7 @@ from tsbench.viewer.stage import furnish
 
 
 def stands(push: str | None = None) -> Recording:
-    force = None if push is None else parse_push(push)
+    force = None if push is None else parse_push(push, tasks.make("laikago_trot"))
     return record_episode(tasks.make("laikago_trot"), lambda o: np.zeros((len(o), 12)), force)
 
 

@@ -31,7 +31,6 @@ from tsbench.errors import TsbenchError
 from tsbench.sim.model import load_spec
 from tsbench.viewer import page, report, scene
 from tsbench.viewer.framing import framing
-from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.show import (
     EXECUTED_COLOUR,
     PLAN_COLOUR,
@@ -525,7 +524,7 @@ def test_a_push_is_seen_while_it_lasts(
     browser: Browser, make_run: Callable[..., Path], tmp_path: Path
 ) -> None:
     path = tmp_path / "push.html"
-    shown = subject(str(make_run("laikago_trot"))).show(parse_push("100N@0.5s:+y"))
+    shown = subject(str(make_run("laikago_trot"))).show("100N@0.5s:+y")
     page.write(path, page.render(shown))
     assert path.stat().st_size < 2e6
     during, after = browser.picture(path, "t=0.55&view=follow"), browser.picture(path, "t=0.7")

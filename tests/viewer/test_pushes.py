@@ -8,16 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tsbench import tasks
 from tsbench.errors import TsbenchError
+from tsbench.sim.push import direction
 from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.subject import pair, subject
+
+WALK = tasks.make("laikago_walk")
 
 
 @pytest.mark.parametrize(
     ("text", "time", "force"),
     [
         ("100N@0.5s:+y", 0.5, (0.0, 100.0, 0.0)),
-        ("2.5N@3s:-z", 3.0, (0.0, 0.0, -2.5)),
+        ("2.5N@3s:-y", 3.0, (0.0, -2.5, 0.0)),
         ("100N @ 0.5s : -x", 0.5, (-100.0, 0.0, 0.0)),
         ("10N@0s:90", 0.0, (0.0, 10.0, 0.0)),
         ("10N@0s:-60", 0.0, (5.0, -8.660254037844386, 0.0)),
@@ -25,9 +29,22 @@ from tsbench.viewer.subject import pair, subject
     ],
 )
 def test_pushes_in_words(text: str, time: float, force: tuple[float, float, float]) -> None:
-    push = parse_push(text)
+    push = parse_push(text, WALK)
     assert (push.time, push.duration) == (time, 0.1)
     np.testing.assert_allclose(push.force, force, atol=1e-12)
+
+
+def test_a_push_stays_in_the_plane_that_scores_push_in() -> None:
+    """The rocket's is x-z: a heading means the same in the viewer and in a score."""
+    rocket = tasks.make("rocket_navigation")
+    np.testing.assert_allclose(parse_push("9N@1s:90", rocket).force, [0, 0, 9], atol=1e-12)
+    np.testing.assert_allclose(parse_push("9N@1s:-z", rocket).force, [0, 0, -9])
+    scored = 9 * direction(rocket, np.pi / 2)
+    np.testing.assert_allclose(parse_push("9N@1s:90", rocket).force, scored, atol=1e-12)
+    with pytest.raises(TsbenchError, match=r"leaves the plane .* \+x, -x, \+z, -z or an angle"):
+        parse_push("9N@1s:+y", rocket)
+    with pytest.raises(TsbenchError, match=r"allowed are \+x, -x, \+y, -y or an angle"):
+        parse_push("9N@1s:+z", WALK)
 
 
 @pytest.mark.parametrize(
@@ -36,14 +53,14 @@ def test_pushes_in_words(text: str, time: float, force: tuple[float, float, floa
      "nanN@0s:+x", "1e3N@0s:+x", "1N@0s:+x+y"],
 )  # fmt: skip
 def test_what_is_no_push_is_told_what_one_is(text: str) -> None:
-    with pytest.raises(TsbenchError, match=r"cannot read the push .*such as 100N@0\.5s:\+y"):
-        parse_push(text)
+    with pytest.raises(TsbenchError, match=r"cannot read the push .*such as 100N@0\.5s:\+x"):
+        parse_push(text, WALK)
 
 
 def test_a_push_after_the_end_is_refused(make_run: Callable[..., Path]) -> None:
     run = str(make_run("rocket_navigation"))
-    assert subject(run).show(parse_push("9N@3.6s:+x")).title
-    late = parse_push("9N@3.7s:+x")  # it has fallen out of the world by then
+    assert subject(run).show("9N@3.6s:+x").title
+    late = "9N@3.7s:+x"  # it has fallen out of the world by then
     with pytest.raises(TsbenchError, match=r"a push at 3\.7 s comes after .* end at 3\.68 s"):
         subject(run).show(late)
     with pytest.raises(TsbenchError, match="comes after"):

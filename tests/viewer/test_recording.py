@@ -13,8 +13,8 @@ from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.motion import ReferenceMotion
 from tsbench.sim.episodes import PolicyFunction
+from tsbench.sim.push import Push
 from tsbench.tasks.laikago import LaikagoState
-from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.recording import record_episode, record_motion
 
 
@@ -62,7 +62,9 @@ def test_who_stands_still_is_held_where_his_mass_is() -> None:
 
 def test_a_push_is_recorded_as_it_acted() -> None:
     recording = record_episode(
-        tasks.make("laikago_trot"), steadily(*[0.0] * 12), parse_push("50N@0.5s:+y")
+        tasks.make("laikago_trot"),
+        steadily(*[0.0] * 12),
+        Push(0.5, 0.1, np.array([0.0, 50.0, 0.0])),
     )
     still = record_episode(tasks.make("laikago_trot"), steadily(*[0.0] * 12))
     steps = np.flatnonzero(recording.forces.any(axis=(1, 2)))
@@ -81,9 +83,9 @@ def test_a_motion_is_seen_as_the_task_sees_it(
     recording = record_motion(task, motion)
     assert recording.duration == pytest.approx(motion.duration)
     assert recording.goal_distance[0] == pytest.approx(1.584)
-    np.testing.assert_allclose(recording.support.feet, motion.feet, atol=1e-9)
+    np.testing.assert_allclose(recording.support.feet, motion.tracked["feet"], atol=1e-9)
     assert recording.scheduled is not None
-    np.testing.assert_array_equal(recording.scheduled, motion.contacts)
+    np.testing.assert_array_equal(recording.scheduled, motion.tracked["contacts"])
     assert recording.solved is None
     with pytest.raises(TsbenchError, match="is for laikago_walk version 1, not for laikago_trot"):
         record_motion(tasks.make("laikago_trot"), motion)

@@ -31,7 +31,6 @@ from tsbench import methods
 from tsbench.bench import Findings, comparison
 from tsbench.bench.turns import Effort, Range
 from tsbench.config import compose
-from tsbench.mdp import Task
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS
 from tsbench.problem import Problem
@@ -44,6 +43,7 @@ from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.gym import GymEnvironment
 from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
+from tsbench.task import Task
 from tsbench.workspace import RunWorkspace
 
 LEARNING_RATE = 3e-4  # Stable-Baselines3's own

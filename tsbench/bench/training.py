@@ -22,6 +22,7 @@ from tsbench.rl.stages import learn_physics, learn_planning, settings
 from tsbench.run import prepare
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.tracking import Imitation
+from tsbench.task import plannable
 from tsbench.workspace import RunWorkspace
 
 TASKS = ("laikago_trot", "rocket_navigation")
@@ -47,8 +48,8 @@ def train(problem: Problem, stage: str, steps: int) -> list[dict[str, float]]:
         if stage == "plan":
             learn_planning(problem, workspace, steps)
         else:
-            reference = problem.task.reference(naive_plan(problem.task))
-            imitation = Imitation(problem.task, reference)
+            task = plannable(problem.task)
+            imitation = Imitation(task, task.reference(naive_plan(task)))
             learn_physics(problem, workspace, stage, imitation, stage, steps)
         workspace.close()
         lines = (Path(folder) / METRICS).read_text(encoding="utf-8").splitlines()

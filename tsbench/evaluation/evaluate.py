@@ -13,13 +13,14 @@ from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import V1, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import robustness
 from tsbench.evaluation.score import Score, Summary
-from tsbench.mdp import Start, Task
 from tsbench.motion import ActionLog
 from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
+from tsbench.state import Start
+from tsbench.task import Task
 
 
 def evaluate(

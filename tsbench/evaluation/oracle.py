@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.mdp import Task
+from tsbench.task import Task
 
 
 def best_return(task: Task[Any]) -> float:
@@ -16,6 +16,10 @@ def best_return(task: Task[Any]) -> float:
     states = task.ideal()
     before, after = states.rows(slice(0, -1)), states.rows(slice(1, None))
     rewards = task.reward(before, np.zeros((task.horizon, task.action_size)), after)
-    length = int(np.argmax([*task.terminal(after), True])) + 1
-    credit = (task.horizon - length) * task.max_reward if length <= task.horizon else 0.0
-    return float(rewards[:length].sum()) + credit
+    violated = np.logical_or.accumulate(task.violated(after))
+    ends = task.terminal(after)
+    if not ends.any():
+        return float(rewards.sum())
+    last = int(np.argmax(ends))
+    spared = task.spared(after, violated)[last]
+    return float(rewards[: last + 1].sum()) + float(task.credit(spared))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import sys
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -15,10 +14,10 @@ from threadpoolctl import threadpool_info
 
 from tsbench.adapters import ForeignPolicy
 from tsbench.evaluation.protocol import Protocol
-from tsbench.mdp import Task
 from tsbench.policy import Policy
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import compiled_hash, fingerprint
+from tsbench.task import Task
 
 PACKAGES = ("mujoco", "numpy", "scipy", "tsbench")
 
@@ -84,23 +83,6 @@ def machine() -> dict[str, str]:
 
 
 def constants_hash(task: Task[Any]) -> str:
-    """sha256 of a task's own constants and of the numbers that its file defines, but for those
-    named TRACKING_...: by the reward for imitating, nothing is judged."""
-    module = vars(sys.modules[type(task).__module__])
-    numbers = {
-        name: value
-        for name, value in module.items()
-        if name.isupper() and not name.startswith("TRACKING_") and _numeric(value)
-    }
-    content = json.dumps([task.constants(), numbers], sort_keys=True, default=_plain)
+    """sha256 of what a task says that decides its scores (`Task.constants`)."""
+    content = json.dumps(dict(task.constants()), sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()
-
-
-def _numeric(value: Any) -> bool:
-    if isinstance(value, tuple):
-        return all(_numeric(part) for part in value)
-    return isinstance(value, (int, float, np.ndarray))
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else vars(value)

@@ -28,8 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.mdp import Start, Task
 from tsbench.sim.change import Change
+from tsbench.state import Start
+from tsbench.task import Task
 
 REFERENCE_MASS = 25.433  # kg, of Laikago
 

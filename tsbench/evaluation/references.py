@@ -20,7 +20,7 @@ from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.score import Score
-from tsbench.mdp import MDP, Task
+from tsbench.task import MDP, Task
 
 FILE = Path(__file__).with_name("references.json")
 DECIMALS = 6  # of an observation that the random policy tells apart

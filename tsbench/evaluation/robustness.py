@@ -10,10 +10,11 @@ from scipy.optimize import isotonic_regression
 from scipy.stats import binomtest
 
 from tsbench.evaluation.protocol import REFERENCE_MASS, Protocol
-from tsbench.mdp import Start, Task
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
-from tsbench.sim.push import Push
+from tsbench.sim.push import Push, direction
+from tsbench.state import Start
+from tsbench.task import Task
 
 
 @dataclass(frozen=True)
@@ -117,15 +118,11 @@ def survival(
     survived = np.zeros(shape, bool)
     if alive.any():
         force, heading, phase = np.nonzero(np.broadcast_to(alive, shape))
-        across, along = np.array(task.push_plane)
-        direction = (
-            np.cos(headings)[heading, None] * across + np.sin(headings)[heading, None] * along
-        )
         starts = moments.rows(phase)
         push = Push(
             time=starts.time,
             duration=np.full(len(phase), protocol.duration),
-            force=forces[force, None] * direction,
+            force=forces[force, None] * direction(task, headings[heading]),
         )
         physics: Physics[Any] = Physics(task, len(phase), threads=threads, push=push)
         begin = physics.place(np.arange(len(phase)), starts)

@@ -15,9 +15,10 @@ from tsbench.motion import Plan
 from tsbench.policy import Policy
 from tsbench.problem import Problem, Workspace
 from tsbench.rl.stages import learn_physics, learn_planning
-from tsbench.sim.episodes import play
+from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
+from tsbench.task import plannable
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Options:
 
 def train(problem: Problem, workspace: Workspace) -> Policy:
     chosen: Options = options(Options, problem)
-    task, budget = problem.task, problem.budget
+    task, budget = plannable(problem.task), problem.budget
     form = task.imitation_form(chosen.imitation)
 
     planner = learn_planning(problem, workspace, budget.plan, chosen.explore)
@@ -69,7 +70,7 @@ def train(problem: Problem, workspace: Workspace) -> Policy:
     return learner.policy(task, "twostage")
 
 
-def extract(planning: Planning[Any], policy: Policy) -> Plan:
+def extract(planning: Planning[Any], policy: PolicyFunction) -> Plan:
     """The plan: one deterministic episode of the planner."""
     episode = play(planning, planning, policy, 1, seed=0, record=planning.abstraction.flatten)
     length = int(episode.lengths[0])

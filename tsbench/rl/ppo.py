@@ -20,12 +20,12 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
 from tsbench.errors import NotFiniteError, TsbenchError
-from tsbench.mdp import Task
 from tsbench.policy import ACTIVATIONS, ENCODINGS, Policy, PolicyInfo
 from tsbench.rl.update import LeanPPO
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.model import fingerprint
+from tsbench.task import Task
 
 Report = Callable[[int, Mapping[str, float]], None]  # (environment steps so far, metrics)
 
@@ -277,19 +277,15 @@ class Learner:
             self._ppo.learning_rate = rate
 
     def _credit(self, spared: torch.Tensor) -> torch.Tensor:
-        """What perfect steps would earn, discounted, after the goal ended an episode: else hovering
-        just outside it would beat arriving, which is not how episodes are scored."""
+        """What the steps that an arrival spares are credited with, as scores have it, in rewards
+        per step and discounted by actions."""
         s = self.settings
-        discount, left = s.discount**s.repeat, spared / s.repeat
-        if discount == 1.0:
-            return self.environment.mdp.max_reward * left
-        sums = discount * (1.0 - discount**left) / (1.0 - discount)
-        return self.environment.mdp.max_reward * sums
+        return self.environment.mdp.credit(spared / s.repeat, s.discount**s.repeat)
 
     def _count(self, rewards: torch.Tensor, dones: torch.Tensor, spared: torch.Tensor) -> None:
         repeat = self.settings.repeat  # an episode's last hold counts in full
         self._return += rewards.numpy() * repeat
-        self._return += spared.numpy() * self.environment.mdp.max_reward
+        self._return += self.environment.mdp.credit(spared.numpy())
         self._length += repeat
         ended = np.flatnonzero(dones.numpy())
         self._returns.extend(self._return[ended].tolist())

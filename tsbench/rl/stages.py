@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tsbench.errors import TsbenchError, unknown
-from tsbench.mdp import Task
 from tsbench.problem import Monitor, Problem, Workspace
 from tsbench.rl.ppo import Learner, PPOSettings, Report
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
+from tsbench.task import SimulatedTask
 from tsbench.typed import typed_items
 
 KINDS = ("plan", "imitate", "task", "finetune")
@@ -92,7 +92,7 @@ def learn_physics(
     problem: Problem,
     workspace: Workspace,
     name: str,
-    task: Task[Any],
+    task: SimulatedTask[Any],
     kind: str,
     steps: int,
     start_from: Learner | None = None,

@@ -18,11 +18,13 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from tsbench.arrays import Array, step_of
 from tsbench.errors import NotFiniteError, TsbenchError
-from tsbench.mdp import MDP, Array, Readings, Rng, S, Start, State, Task
 from tsbench.sim.change import Change
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
+from tsbench.state import Readings, Rng, S, Start, State
+from tsbench.task import MDP, SimulatedTask
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 _NUMBER = 1  # of a kind of warning, beside what it was about, in `Batch.warning`
@@ -80,7 +82,7 @@ class Physics(Generic[S]):
 
     def __init__(
         self,
-        task: Task[S],
+        task: SimulatedTask[S],
         count: int,
         *,
         threads: int | None = None,
@@ -90,26 +92,27 @@ class Physics(Generic[S]):
     ) -> None:
         """`threads` None means all cores; `perturbed` picks the task's perturbed starts."""
         self.task = task
+        self.plant = task.plant
         self.perturbed = perturbed
         self.push = push
         self.substeps = 0
         self.seconds = 0.0
         self.warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), int)
         self.diverged = np.zeros(0, int)
-        spec = task.spec()
+        spec = self.plant.spec()
         spec.compiler.discardvisual = True  # 10 % faster, the same states to the last bit
         model = spec.compile()
         if change is not None:
             change.apply(model)
         # With memory of its own a simulation goes on from the sensors that were brought up to date,
         # which otherwise costs half a substep; among twenty substeps that does not pay.
-        self.batch = Batch(model, count, threads or 0, persistent=task.substeps == 1)
+        self.batch = Batch(model, count, threads or 0, persistent=self.plant.substeps == 1)
         self._sensors = sensor_slices(model)
         self._qpos = self.batch.bind("qpos")
         self._qvel = self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
         self._sensordata = self.batch.bind("sensordata")
-        self._force = self.batch.bind("xfrc_applied")[:, model.body(task.pushed).id, :3]
+        self._force = self.batch.bind("xfrc_applied")[:, model.body(self.plant.pushed).id, :3]
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         return self.place(rows, self.task.start(rng, len(rows), perturbed=self.perturbed))
@@ -127,7 +130,7 @@ class Physics(Generic[S]):
         return self._read(rows, start.time, start.memory)
 
     def advance(self, state: S, action: Array, rows: np.ndarray | None = None) -> S:
-        control, memory = self.task.control(state, action)
+        control, memory = self.plant.control(state, action)
         at = slice(None) if rows is None else rows
         self._ctrl[at] = control
         self._force[at] = self.push_force(state.time, at)
@@ -135,9 +138,9 @@ class Physics(Generic[S]):
         began = perf_counter()
         with _one_line():
             ids = None if rows is None else np.asarray(rows, np.int32)
-            self.batch.step(ids, nstep=self.task.substeps, stage=_CURRENT)
+            self.batch.step(ids, nstep=self.plant.substeps, stage=_CURRENT)
         self.seconds += perf_counter() - began
-        self.substeps += len(control) * self.task.substeps
+        self.substeps += len(control) * self.plant.substeps
         following = self._read(at, state.time + self.task.timestep, memory)
         warned = self.batch.warning[at, :, _NUMBER]
         self.warnings += warned.sum(axis=0)
@@ -177,7 +180,7 @@ class Physics(Generic[S]):
     def _read(self, rows: Any, time: np.ndarray, memory: np.ndarray) -> S:
         # Copies: the batch's arrays change under whoever holds them.
         sensordata = self._sensordata[rows].copy()
-        return self.task.read(
+        return self.plant.read(
             Readings(
                 time=time,
                 qpos=self._qpos[rows].copy(),
@@ -211,7 +214,7 @@ class Transition(Generic[S]):
         truncated: the episode ended with its last step.
         ended: the rows of either kind of ending, shape (k,).
         final: the states that those episodes ended in, k of them.
-        spared: steps that an episode which ended at its goal did not need; they count as perfect.
+        spared: steps that an episode which arrived at its goal did not need (`MDP.spared`).
     """
 
     observation: np.ndarray
@@ -230,6 +233,7 @@ class BatchedEnvironment(Generic[S]):
         state: of all episodes.
         steps: steps taken in each episode since its start, shape (n,). An episode that starts
             along a reference motion starts with the steps that lie before.
+        violated: whether anything was violated in each episode so far, shape (n,).
         seconds: spent in `step` so far, wall-clock.
     """
 
@@ -240,12 +244,14 @@ class BatchedEnvironment(Generic[S]):
         self.rng = np.random.default_rng(seed)
         self.state: S
         self.steps = np.zeros(count, int)
+        self.violated = np.zeros(count, bool)
         self.seconds = 0.0
 
     def reset(self) -> np.ndarray:
         """Starts all episodes; returns the observations, shape (n, observation_size)."""
         self.state = self.dynamics.begin(self.rng, np.arange(self.count))
-        self.steps = np.rint(self.state.time / self.mdp.timestep).astype(int)
+        self.steps = step_of(self.state.time, self.mdp.timestep)
+        self.violated = np.zeros(self.count, bool)
         observation: np.ndarray = self.mdp.observation(self.state)
         return observation
 
@@ -268,15 +274,18 @@ class BatchedEnvironment(Generic[S]):
         diverged = self.dynamics.diverged
         if len(diverged):
             reward[diverged], terminal[diverged] = 0.0, True
+        self.violated |= self.mdp.violated(state)
+        self.violated[diverged] = True
         truncated = (self.steps >= self.mdp.horizon) & ~terminal
         ended = np.flatnonzero(terminal | truncated)
         final = state.rows(ended)
         spared = np.zeros(self.count, int)
         if len(ended):
-            spared[ended] = np.where(terminal[ended], self.mdp.spared(final), 0)
-            spared[diverged] = 0
+            arrived = self.mdp.spared(final, self.violated[ended])
+            spared[ended] = np.where(terminal[ended], arrived, 0)
             fresh = self.dynamics.begin(self.rng, ended)
-            self.steps[ended] = np.rint(fresh.time / self.mdp.timestep).astype(int)
+            self.steps[ended] = step_of(fresh.time, self.mdp.timestep)
+            self.violated[ended] = False
             state = state.updated(ended, fresh)
         self.state = state
         observation = self.mdp.observation(state)
@@ -288,6 +297,7 @@ class BatchedEnvironment(Generic[S]):
         return {
             "rng": self.rng.bit_generator.state,
             "steps": self.steps,
+            "violated": self.violated,
             "state": vars(self.state),
             "dynamics": self.dynamics.snapshot(),
         }
@@ -296,6 +306,7 @@ class BatchedEnvironment(Generic[S]):
         """Goes on from where `snapshot` was taken; `reset` must have been called before."""
         self.rng.bit_generator.state = snapshot["rng"]
         self.steps = snapshot["steps"]
+        self.violated = snapshot["violated"]
         self.state = self.state.replace(**snapshot["state"])
         self.dynamics.restore(snapshot["dynamics"])
 

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.mdp import Rng, S, Task
 from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
-from tsbench.sim.push import Push
+from tsbench.sim.push import Push, direction
+from tsbench.state import Rng, S
+from tsbench.task import SimulatedTask
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class DisturbedPhysics(Physics[S]):
 
     def __init__(
         self,
-        task: Task[S],
+        task: SimulatedTask[S],
         count: int,
         disturbances: Disturbances,
         seed: int,
@@ -74,7 +75,6 @@ class DisturbedPhysics(Physics[S]):
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
         self._first = np.zeros(count)  # seconds into the episode
         self._forces = np.zeros((count, pushes, 3))
-        self._axes = np.array(task.push_plane)
         rng = np.random.default_rng(seed)
         bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
         if any(bounds):
@@ -94,12 +94,11 @@ class DisturbedPhysics(Physics[S]):
         heading = rng.uniform(0.0, 2.0 * math.pi, shape)
         size = rng.uniform(0.0, 1.0, shape) * self._strongest()
         size *= rng.uniform(0.0, 1.0, (len(rows), 1)) >= self.disturbances.calm
-        direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1) @ self._axes
-        self._forces[rows] = size[..., None] * direction
+        self._forces[rows] = size[..., None] * direction(self.plant, heading)
         self._first[rows] = rng.uniform(0.0, self.disturbances.interval, len(rows))
 
     def _strongest(self) -> float:
-        steps, rise = self.substeps / self.task.substeps, self.disturbances.rise
+        steps, rise = self.substeps / self.plant.substeps, self.disturbances.rise
         return self.disturbances.push * (1.0 if steps >= rise else steps / rise)
 
     def snapshot(self) -> dict[str, Any]:

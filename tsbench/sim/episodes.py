@@ -8,8 +8,10 @@ from typing import Generic
 
 import numpy as np
 
-from tsbench.mdp import MDP, S
+from tsbench.arrays import step_of
 from tsbench.sim.batched import Dynamics, expect_finite
+from tsbench.state import S
+from tsbench.task import MDP
 
 PolicyFunction = Callable[[np.ndarray], np.ndarray]  # observations (n, o) -> actions (n, a)
 
@@ -22,11 +24,12 @@ class Episodes(Generic[S]):
         rewards: shape (T, n); zero once an episode has ended.
         lengths: steps taken, shape (n,).
         limits: steps that could be taken, shape (n,): T, or less where an episode began late.
-        reached: whether the episode ended at its goal, unspoiled, shape (n,).
+        spared: steps that the episode did not need, since it arrived at its goal, shape (n,).
         violated: whether something spoiled it on the way, shape (n,). Its physics having diverged,
             which ends it with a reward of zero for that step, does.
         diverged: whether that happened, shape (n,).
         cut: whether it ended for a reason other than its goal or its last step, shape (n,).
+        credit: what the spared steps earn (`MDP.credit`), shape (n,).
         final: the last state of each episode.
         states: what `record` made of every state, start included, shape (T + 1, n, ...), each
             episode's last one repeated after its end; None without `record`.
@@ -37,10 +40,11 @@ class Episodes(Generic[S]):
     rewards: np.ndarray
     lengths: np.ndarray
     limits: np.ndarray
-    reached: np.ndarray
+    spared: np.ndarray
     violated: np.ndarray
     diverged: np.ndarray
     cut: np.ndarray
+    credit: np.ndarray
     final: S
     states: np.ndarray | None
     actions: np.ndarray
@@ -48,10 +52,9 @@ class Episodes(Generic[S]):
 
     @property
     def returns(self) -> np.ndarray:
-        """Undiscounted, shape (n,). The steps missing from an episode that ended at its goal
-        count as perfect ones, those missing from any other as nothing."""
-        credit = self.reached * (self.limits - self.lengths) * self.max_reward
-        total: np.ndarray = self.rewards.sum(axis=0) + credit
+        """Undiscounted, shape (n,). The steps missing from an episode that arrived at its goal are
+        credited, those missing from any other count as nothing."""
+        total: np.ndarray = self.rewards.sum(axis=0) + self.credit
         return total
 
     @property
@@ -94,11 +97,11 @@ def play(
     rows = np.arange(count)
     state = dynamics.begin(np.random.default_rng(seed), rows) if begin is None else begin
     final = state
-    begun = np.rint(state.time / mdp.timestep).astype(int)
+    begun = step_of(state.time, mdp.timestep)
     limits = mdp.horizon - begun
     longest = int(limits.max())
-    reached, violated, diverged, cut = (np.zeros(count, bool) for _ in range(4))
-    lengths = np.zeros(count, int)
+    violated, diverged, cut = (np.zeros(count, bool) for _ in range(3))
+    lengths, spared = np.zeros(count, int), np.zeros(count, int)
     rewards = np.zeros((longest, count))
     actions = np.zeros((longest, count, mdp.action_size))
     pending = np.zeros((delay, count, mdp.action_size))
@@ -120,7 +123,7 @@ def play(
         diverged[rows] = failed
         violated[rows] |= mdp.violated(following) | failed
         terminal, at_goal = mdp.terminal(following) | failed, mdp.reached(following)
-        reached[rows] = terminal & at_goal & ~violated[rows]
+        spared[rows] = np.where(terminal, mdp.spared(following, violated[rows]), 0)
         cut[rows] = terminal & ~at_goal
         going = ~terminal & (lengths[rows] < limits[rows])
         if record:
@@ -137,10 +140,11 @@ def play(
         rewards=rewards,
         lengths=lengths,
         limits=limits,
-        reached=reached,
+        spared=spared,
         violated=violated,
         diverged=diverged,
         cut=cut,
+        credit=mdp.credit(spared),
         final=final,
         states=np.stack(recorded) if record else None,
         actions=actions,

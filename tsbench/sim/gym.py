@@ -19,8 +19,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from tsbench.errors import TsbenchError, unknown
-from tsbench.mdp import MDP
 from tsbench.sim.batched import BatchedEnvironment
+from tsbench.task import MDP
 
 RENDER_MODES = ("rgb_array",)
 HEIGHT, WIDTH = 480, 640  # pixels

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.mdp import MDP, Array, Rng, S, Task
+from tsbench.arrays import Array
 from tsbench.motion import Plan
+from tsbench.state import Rng, S
+from tsbench.task import MDP, Task, plannable
 
 
 class Planning(MDP[S]):
@@ -22,8 +24,12 @@ class Planning(MDP[S]):
 
     def __init__(self, task: Task[S], *, explore: float = 0.0) -> None:
         """`explore` is the share of episodes that begin at a sampled state instead of the start:
-        in kinematics any state can be visited at will, which is what makes planning easy."""
-        self.task = task
+        in kinematics any state can be visited at will, which is what makes planning easy.
+
+        Raises:
+            TsbenchError: the task has no planning variant.
+        """
+        self.task = task = plannable(task)
         self.explore = explore
         self.abstraction = task.abstraction()
         self.name = task.name
@@ -38,15 +44,11 @@ class Planning(MDP[S]):
         return self.abstraction.observation(state)
 
     def value_observation(self, state: S) -> Array:
-        if self.abstraction.value_observation is None:
-            return self.observation(state)
         return self.abstraction.value_observation(state)
 
     def reward(self, previous: S, action: Array, state: S) -> Array:
         reward = self.task.reward(previous, action, state)
-        if self.abstraction.dynamics_reward is not None:
-            reward = reward * self.abstraction.dynamics_reward(state)
-        return reward
+        return reward * self.abstraction.dynamics_reward(state)
 
     def terminal(self, state: S) -> Array:
         return self.task.terminal(state)

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+
+from tsbench.task import Plant
+
+
+def direction(plant: Plant[Any], heading: np.ndarray | float) -> np.ndarray:
+    """The direction in the world frame of a push with a heading, in radians from the first axis of
+    `Plant.push_plane` to the second, shape (...,) -> (..., 3)."""
+    first, second = np.array(plant.push_plane)
+    heading = np.asarray(heading)[..., None]
+    return np.asarray(np.cos(heading) * first + np.sin(heading) * second)
 
 
 @dataclass(frozen=True)
 class Push:
-    """A constant force for a while on the body that a task lets be pushed (`Task.pushed`), at its
+    """A constant force for a while on the body that a task lets be pushed (`Plant.pushed`), at its
     centre of mass. One for all episodes, or, with a leading axis n everywhere, one for each.
 
     Attributes:

@@ -14,12 +14,14 @@ from dm_control import mujoco as dm_mujoco
 from dm_control.mujoco.wrapper import MjModel
 from dm_control.rl import control
 
-from tsbench.mdp import MDP, Array, Readings, State, Task
+from tsbench.arrays import Array, step_of
 from tsbench.sim.batched import expect_finite, expect_shape
 from tsbench.sim.change import Change
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
+from tsbench.state import Readings, State
+from tsbench.task import MDP, SimulatedTask
 
 ROW = np.array([0])  # the batch of one that every state here is
 
@@ -39,6 +41,7 @@ class Adapter(control.Task):
         self._previous: State
         self._action: Array
         self._steps = 0
+        self._violated = False
 
     @abstractmethod
     def begin(self, physics: dm_mujoco.Physics) -> None:
@@ -46,7 +49,8 @@ class Adapter(control.Task):
 
     def initialize_episode(self, physics: dm_mujoco.Physics) -> None:
         self.begin(physics)
-        self._steps = round(float(self.state.time[0]) / self.mdp.timestep)
+        self._steps = int(step_of(self.state.time, self.mdp.timestep)[0])
+        self._violated = False
 
     def before_step(self, action: np.ndarray, physics: dm_mujoco.Physics) -> None:
         self._previous = self.state
@@ -67,10 +71,18 @@ class Adapter(control.Task):
             return 0.0
         return 1.0 if self._steps >= self.mdp.horizon else None
 
+    def after_step(self, physics: dm_mujoco.Physics) -> None:
+        self.follow(physics)
+        self._violated |= bool(self.mdp.violated(self.state)[0])
+
+    @abstractmethod
+    def follow(self, physics: dm_mujoco.Physics) -> None:
+        """Sets `state` to what the step has led to."""
+
     def spared(self) -> int:
         """Steps that the arrival which ended the episode spares (`MDP.spared`), else zero."""
         ended = bool(self.mdp.terminal(self.state)[0])
-        return int(self.mdp.spared(self.state)[0]) if ended else 0
+        return int(self.mdp.spared(self.state, np.array([self._violated]))[0]) if ended else 0
 
     def action_spec(self, physics: dm_mujoco.Physics) -> dm_env.specs.BoundedArray:
         return dm_env.specs.BoundedArray(
@@ -91,10 +103,11 @@ class PhysicsAdapter(Adapter):
     """
 
     def __init__(
-        self, task: Task[Any], rng: np.random.Generator, perturbed: bool, push: Push | None
+        self, task: SimulatedTask[Any], rng: np.random.Generator, perturbed: bool, push: Push | None
     ) -> None:
         super().__init__(task, rng)
         self.task = task
+        self.plant = task.plant
         self.perturbed = perturbed
         self.push = push
 
@@ -107,16 +120,18 @@ class PhysicsAdapter(Adapter):
 
     def before_step(self, action: np.ndarray, physics: dm_mujoco.Physics) -> None:
         super().before_step(action, physics)
-        ctrl, self._memory = self.task.control(self.state, self._action)
+        ctrl, self._memory = self.plant.control(self.state, self._action)
         physics.set_control(ctrl[0])
-        body = physics.model.name2id(self.task.pushed, "body")
+        body = physics.model.name2id(self.plant.pushed, "body")
         physics.data.xfrc_applied[body] = 0.0
         if self.push is not None:
             force = self.push.during(self.state.time, self.task.timestep)
             physics.data.xfrc_applied[body, :3] = force[0]
 
-    def after_step(self, physics: dm_mujoco.Physics) -> None:
-        if not physics.diverged:
+    def follow(self, physics: dm_mujoco.Physics) -> None:
+        if physics.diverged:
+            self._violated = True
+        else:
             self._read(physics, self.state.time + self.task.timestep, self._memory)
 
     def get_reward(self, physics: dm_mujoco.Physics) -> float:
@@ -128,7 +143,7 @@ class PhysicsAdapter(Adapter):
     def _read(self, physics: dm_mujoco.Physics, time: np.ndarray, memory: np.ndarray) -> None:
         data = physics.data
         sensors = sensor_slices(physics.model.ptr)
-        self.state = self.task.read(
+        self.state = self.plant.read(
             Readings(
                 time=time,
                 qpos=data.qpos[None].copy(),
@@ -152,7 +167,7 @@ class PlanningAdapter(Adapter):
         self.state = self.planning.begin(self.rng, ROW)
         self._pose(physics)
 
-    def after_step(self, physics: dm_mujoco.Physics) -> None:
+    def follow(self, physics: dm_mujoco.Physics) -> None:
         self.state = self.planning.advance(self.state, self._action)
         self._pose(physics)
 
@@ -206,7 +221,7 @@ class StillPhysics(dm_mujoco.Physics):
 
 
 def environment(
-    mdp: Task[Any] | Planning[Any],
+    mdp: SimulatedTask[Any] | Planning[Any],
     seed: int | None = None,
     *,
     perturbed: bool = False,
@@ -220,10 +235,10 @@ def environment(
         physics = StillPhysics.from_model(MjModel(mdp.task.spec().compile()))
         physics.plan_timestep = mdp.timestep
         return control.Environment(physics, PlanningAdapter(mdp, rng), n_sub_steps=1)
-    model = mdp.spec().compile()
+    model = mdp.plant.spec().compile()
     if change is not None:
         change.apply(model)
     physics = ExactPhysics.from_model(MjModel(model))
     return control.Environment(
-        physics, PhysicsAdapter(mdp, rng, perturbed, push), n_sub_steps=mdp.substeps
+        physics, PhysicsAdapter(mdp, rng, perturbed, push), n_sub_steps=mdp.plant.substeps
     )

@@ -2,98 +2,61 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import mujoco
-
-from tsbench.mdp import Abstraction, Array, Readings, Rng, S, Start, Task, array_namespace
-from tsbench.motion import Audit, Plan, ReferenceMotion
+from tsbench.arrays import Array, array_namespace
+from tsbench.motion import ReferenceMotion
+from tsbench.state import Rng, S, Start
+from tsbench.task import Plant, SimulatedTask, Task, plannable
 
 
-class Imitation(Task[S]):
-    """A task whose reward, start and early ending follow a reference motion."""
+class Imitation(SimulatedTask[S]):
+    """A task whose reward, start and early ending follow a reference motion.
+
+    Observations, actions and physics are the task's (P).
+
+    Attributes:
+        task: that is imitated in.
+        tracker: what replaces the task's reward, start and ending.
+    """
 
     def __init__(self, task: Task[S], reference: ReferenceMotion, form: str | None = None) -> None:
         """`form` picks one of the task's tracking rewards.
 
         Raises:
-            TsbenchError: the reference does not fit the task, or `form` is unknown.
+            TsbenchError: the task has no such variant, the reference does not fit it, or `form` is
+                unknown.
         """
+        self.task = task = plannable(task)
         task.check_fit(reference)
-        self.task = task
-        self._reference = reference
-        self.tracking = task.tracker(reference, form)
-        self.name = task.name
-        self.version = task.version
-        self.horizon = self.tracking.horizon
+        self.tracker = task.tracker(reference, form)
+        self.name, self.version = task.name, task.version
         self.timestep = task.timestep
-        self.substeps = task.substeps
-        self.pushed = task.pushed
-        self.push_plane = task.push_plane
-        self.imitation_forms = task.imitation_forms
-        self.observation_size = task.observation_size
-        self.action_size = task.action_size
-        self.max_reward = self.tracking.max_reward
+        self.observation_size, self.action_size = task.observation_size, task.action_size
+        self.horizon, self.max_reward = self.tracker.horizon, self.tracker.max_reward
 
-    def reward(self, previous: S, action: Array, state: S) -> Array:
-        return self.tracking.reward(previous, action, state)
-
-    def terminal(self, state: S) -> Array:
-        return self.tracking.terminal(state)
-
-    def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
-        """Starts along the reference motion; perturbed, anywhere near the task's own start."""
-        return (
-            self.task.start(rng, count, perturbed=True)
-            if perturbed
-            else self.tracking.start(rng, count)
-        )
+    @property
+    def plant(self) -> Plant[S]:
+        return self.task
 
     def observation(self, state: S) -> Array:
         return self.task.observation(state)
 
-    def spec(self) -> mujoco.MjSpec:
-        return self.task.spec()
+    def value_observation(self, state: S) -> Array:
+        return self.task.value_observation(state)
 
-    def control(self, state: S, action: Array) -> tuple[Array, Array]:
-        return self.task.control(state, action)
+    def reward(self, previous: S, action: Array, state: S) -> Array:
+        return self.tracker.reward(previous, action, state)
 
-    def read(self, readings: Readings) -> S:
-        return self.task.read(readings)
-
-    def memory(self, state: S) -> Array:
-        return self.task.memory(state)
-
-    @property
-    def push_steps(self) -> tuple[int, ...]:
-        return self.task.push_steps
-
-    def success(self, state: S) -> Array:
-        return self.task.success(state)
+    def terminal(self, state: S) -> Array:
+        return self.tracker.terminal(state)
 
     def violated(self, state: S) -> Array:
         return self.task.violated(state)
 
-    def goal_distance(self, state: S) -> Array:
-        return self.task.goal_distance(state)
-
-    def ideal(self) -> S:
-        return self.task.ideal()
-
-    def abstraction(self) -> Abstraction[S]:
-        return self.task.abstraction()
-
-    def reference(self, plan: Plan) -> ReferenceMotion:
-        return self.task.reference(plan)
-
-    def audit(self, plan: Plan, reference: ReferenceMotion) -> Audit:
-        return self.task.audit(plan, reference)
-
-    def constants(self) -> dict[str, Any]:
-        return self.task.constants()
-
-    def tracker(self, reference: ReferenceMotion, form: str | None = None) -> Any:
-        return self.task.tracker(reference, form)
+    def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
+        """Starts along the reference motion; perturbed, anywhere near the task's own start."""
+        if perturbed:
+            return self.task.start(rng, count, perturbed=True)
+        return self.tracker.start(rng, count)
 
 
 def deepmimic_reward(pose: Array, velocity: Array, end_effectors: Array, com: Array) -> Array:

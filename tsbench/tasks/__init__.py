@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from tsbench.errors import TsbenchError, unknown
-from tsbench.mdp import Task
+from tsbench.task import Task
 
 Factory = Callable[..., Task[Any]]
 
@@ -60,4 +60,4 @@ def make(name: str, **constants: Any) -> Task[Any]:
 
 def standard(task: Task[Any]) -> bool:
     """Whether the task has the constants that scores are ranked by."""
-    return task == make(task.name)
+    return task.constants() == make(task.name).constants()

@@ -1,54 +1,66 @@
 """Rocket: fly a planar lander with three engines to a goal far away, past obstacles.
 
 World frame: x to the right, z up, in metres; angles counter-clockwise from upright, in radians.
-Marks: P the paper fixes it, D decided here, C calibrated (docs/calibration.md).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from tsbench.mdp import (
-    Abstraction,
-    Array,
-    Drawing,
-    Flame,
-    Readings,
-    Rng,
-    Start,
-    State,
-    Task,
-    Tracker,
-    array_namespace,
-)
+from tsbench.arrays import Array, array_namespace, like
+from tsbench.constants import constant
+from tsbench.drawing import Drawing, Flame
 from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.planning.path import Path
 from tsbench.sim.model import load_spec
+from tsbench.state import Readings, Rng, Start, State
+from tsbench.task import Abstraction, Plannable, Tracker
 from tsbench.tasks import register
 
-CONTROL_TIMESTEP = 1 / 50  # s, control and simulation (P)
-MAIN_THRUST = 50.0  # N per unit of action (P)
-SIDE_THRUST = 10.0  # N per unit of action (P)
-DEAD_ZONE = 0.5  # of each engine's action (P)
-GOAL_WEIGHT, GOAL_DECAY = 0.9, -0.25  # w1, k1 (P)
-OBSTACLE_WEIGHT, OBSTACLE_DECAY = 0.075, -0.5  # w2 = w3, k2 = k3 (P)
-OBSTACLE_RADIUS = 0.5  # m (D)
-HULL_RADIUS = 0.72  # m, to the lander's farthest corner: what a plan keeps clear at any angle (D)
 
-FLAMES = (  # from the nozzles in models/rocket.xml; a positive side force leaves on the right
-    Flame("rocket", "main", (0.0, 0.0, -0.58), (0.0, 0.0, -1.0), length=0.03),
-    Flame("rocket", "side", (0.59, 0.0, 0.365), (1.0, 0.0, 0.0), length=0.05),
-    Flame("rocket", "side", (-0.59, 0.0, 0.365), (-1.0, 0.0, 0.0), length=-0.05),
-)
+@dataclass(frozen=True)
+class Constants:
+    """What decides a score, beside the goal, the obstacles and the MJCF."""
 
-PLAN_TIMESTEP = 1 / 20  # s (P)
-PLAN_STEP = 0.25  # m per axis and plan step (P)
-PLAN_TURN = 0.05  # rad per plan step (P prints degrees; D: see spec section 1)
+    control_timestep: float = constant(1 / 50, "s", "P", "of control and simulation")
+    main_thrust: float = constant(50.0, "N", "P", "of the main engine, per unit of action")
+    side_thrust: float = constant(10.0, "N", "P", "of a side engine, per unit of action")
+    dead_zone: float = constant(0.5, "", "P", "of each engine's action")
+    goal_weight: float = constant(0.9, "", "P", "w1")
+    goal_decay: float = constant(-0.25, "1/m", "P", "k1")
+    obstacle_weight: float = constant(0.075, "", "P", "w2 = w3")
+    obstacle_decay: float = constant(-0.5, "1/m", "P", "k2 = k3")
+    obstacle_radius: float = constant(0.5, "m", "D", "of an obstacle")
+    hull_radius: float = constant(
+        0.72, "m", "D", "to the lander's farthest corner: what a plan keeps clear at any angle"
+    )
+    direction: float = constant(math.radians(30.0), "rad", "C", "of the goal above the horizon")
+    margin: float = constant(10.0, "m", "C", "between the start or goal and the world's bounds")
+    horizon_ratio: float = constant(
+        1.5, "", "C", "horizon over the planner's flight time: arrive, then hover"
+    )
+    success_distance: float = constant(1.0, "m", "D", "from the goal at most, at the end")
+    success_speed: float = constant(1.0, "m/s", "D", "at most, at the end")
+    start_spread: tuple[float, float, float] = constant(
+        (0.5, 0.5, 0.2), "m, m, rad", "D", "of perturbed starts; of their velocities per second"
+    )
+    pushes: int = constant(16, "", "D", "instants of the flight at which pushes are tried")
+    plan_timestep: float = constant(1 / 20, "s", "P", "between plan states")
+    plan_step: float = constant(0.25, "m", "P", "at most, per axis and plan step")
 
-# Of the imitation reward; no score depends on them.
+
+C = Constants()
+
+# The paper prints degrees; spec section 1 says why this is in radians.
+PLAN_TURN = 0.05  # rad per plan step (P, unit D)
+
+# Of the imitation reward. No score depends on them.
 TRACKING_DECAY = -0.625  # k_imi (P)
 TRACKING_PENALTY = 0.25  # of a collision (P)
 TRACKING_ARRIVAL = 1.0  # m, over which arriving is felt (C)
@@ -57,12 +69,11 @@ TRACKING_ADVANCE = 1.0  # per metre that a step brings along the reference (C)
 # tumble when they brake. Going back costs what it costs: no rocket does 25 m/s.
 TRACKING_LIMITS = (-0.5, 0.2)
 
-DIRECTION = math.radians(30.0)  # of the goal above the horizon (C)
-MARGIN = 10.0  # m between the start or goal and the world's bounds (C)
-HORIZON_RATIO = 1.5  # horizon over the planner's flight time: arrive, then hover (C)
-SUCCESS_DISTANCE, SUCCESS_SPEED = 1.0, 1.0  # m, m/s (D)
-START_SPREAD = (0.5, 0.5, 0.2)  # m, m, rad, and of the velocities the same per second (D)
-PUSHES = 16  # instants of the flight at which pushes are tried (D)
+FLAMES = (  # from the nozzles in models/rocket.xml; a positive side force leaves on the right
+    Flame("rocket", "main", (0.0, 0.0, -0.58), (0.0, 0.0, -1.0), length=0.03),
+    Flame("rocket", "side", (0.59, 0.0, 0.365), (1.0, 0.0, 0.0), length=0.05),
+    Flame("rocket", "side", (-0.59, 0.0, 0.365), (-1.0, 0.0, 0.0), length=-0.05),
+)
 
 
 @dataclass(frozen=True)
@@ -91,7 +102,7 @@ def wrap(angle: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Rocket(Task[RocketState]):
+class Rocket(Plannable[RocketState]):
     """Navigation when there are no obstacles.
 
     Attributes:
@@ -103,24 +114,28 @@ class Rocket(Task[RocketState]):
     distance: float
     obstacles: tuple[tuple[float, float], ...]
     horizon: int
-    version: int = 1
-    timestep: float = CONTROL_TIMESTEP
-    substeps: int = 1
-    observation_size: int = 10
-    action_size: int = 2
-    max_reward: float = GOAL_WEIGHT
-    imitation_forms: tuple[str, ...] = ("progress", "paper")
+    version = 1
+    timestep = C.control_timestep
+    substeps = 1
+    observation_size = 10
+    action_size = 2
+    max_reward = C.goal_weight
+    imitation_forms = ("progress", "paper")
     pushed = "rocket"
     push_plane = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 
-    @property
+    @cached_property
     def goal(self) -> np.ndarray:
-        return self.distance * np.array([math.cos(DIRECTION), math.sin(DIRECTION)])
+        """Metres, shape (2,)."""
+        return self.distance * np.array([math.cos(C.direction), math.sin(C.direction)])
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower left and upper right corner of the world in metres. The start is the origin."""
-        return np.full(2, -MARGIN), self.goal + MARGIN
+        return np.full(2, -C.margin), self.goal + C.margin
+
+    def constants(self) -> dict[str, Any]:
+        return {**asdict(self), "max_reward": self.max_reward, **asdict(C)}
 
     # The MDP
 
@@ -132,15 +147,15 @@ class Rocket(Task[RocketState]):
                 wrap(state.angle)[..., None],
                 state.velocity,
                 state.angular_velocity[..., None],
-                self._towards_goal(state),
+                self.towards_goal(state),
             ],
             axis=-1,
         )
 
-    def _towards_goal(self, state: RocketState) -> Array:
+    def towards_goal(self, state: RocketState) -> Array:
         """Goal relative to the rocket (2), distance, heading error; shape (..., 4)."""
         xp = array_namespace(state.position)
-        offset = xp.asarray(self.goal) - state.position
+        offset = like(state.position, self.goal) - state.position
         distance = xp.linalg.vector_norm(offset, axis=-1)
         bearing = xp.atan2(offset[..., 1], offset[..., 0])
         heading_error = wrap(bearing - (state.angle + math.pi / 2))
@@ -148,18 +163,20 @@ class Rocket(Task[RocketState]):
 
     def goal_distance(self, state: RocketState) -> Array:
         xp = array_namespace(state.position)
-        return xp.linalg.vector_norm(state.position - xp.asarray(self.goal), axis=-1)
+        return xp.linalg.vector_norm(state.position - like(state.position, self.goal), axis=-1)
 
     def reward_terms(
         self, previous: RocketState, action: Array, state: RocketState
     ) -> dict[str, Array]:
         """w1 exp(k1 |x - goal|) and, of each obstacle, -w2 exp(k2 |x - obstacle|) (P)."""
         xp = array_namespace(state.position)
-        terms = {"near the goal": GOAL_WEIGHT * xp.exp(GOAL_DECAY * self.goal_distance(state))}
+        terms = {"near the goal": C.goal_weight * xp.exp(C.goal_decay * self.goal_distance(state))}
         for number, obstacle in enumerate(self.obstacles, 1):
-            offset = state.position - xp.asarray(obstacle)
+            offset = state.position - like(state.position, obstacle)
             distance = xp.linalg.vector_norm(offset, axis=-1)
-            terms[f"near obstacle {number}"] = -OBSTACLE_WEIGHT * xp.exp(OBSTACLE_DECAY * distance)
+            terms[f"near obstacle {number}"] = -C.obstacle_weight * xp.exp(
+                C.obstacle_decay * distance
+            )
         return terms
 
     def reward(self, previous: RocketState, action: Array, state: RocketState) -> Array:
@@ -169,19 +186,22 @@ class Rocket(Task[RocketState]):
     def terminal(self, state: RocketState) -> Array:
         """Out of bounds (P)."""
         xp = array_namespace(state.position)
-        low, high = (xp.asarray(corner) for corner in self.bounds)
+        low, high = (like(state.position, corner) for corner in self.bounds)
         return xp.any((state.position < low) | (state.position > high), axis=-1)
 
-    def violated(self, state: RocketState) -> Array:
-        """A collision."""
+    def collided(self, state: RocketState) -> Array:
+        """The hull touches an obstacle."""
         xp = array_namespace(state.clearance)
         return xp.any(state.clearance <= 0.0, axis=-1)
+
+    def violated(self, state: RocketState) -> Array:
+        return self.collided(state)
 
     def success(self, state: RocketState) -> Array:
         """At the end of the episode within 1 m of the goal and slower than 1 m/s."""
         xp = array_namespace(state.position)
         speed = xp.linalg.vector_norm(state.velocity, axis=-1)
-        return (self.goal_distance(state) < SUCCESS_DISTANCE) & (speed < SUCCESS_SPEED)
+        return (self.goal_distance(state) < C.success_distance) & (speed < C.success_speed)
 
     # The physics
 
@@ -189,7 +209,7 @@ class Rocket(Task[RocketState]):
         spec = load_spec("rocket")
         x, z = self.goal
         spec.worldbody.add_site(
-            name="goal", pos=[x, 0.0, z], size=[SUCCESS_DISTANCE] * 3, rgba=[0.95, 0.75, 0.1, 0.6]
+            name="goal", pos=[x, 0.0, z], size=[C.success_distance] * 3, rgba=[0.95, 0.75, 0.1, 0.6]
         )
         for number, (x, z) in enumerate(self.obstacles, 1):
             name = f"obstacle_{number}"
@@ -197,7 +217,7 @@ class Rocket(Task[RocketState]):
                 name=name,
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 pos=[x, 0.0, z],
-                size=[OBSTACLE_RADIUS, 0.0, 0.0],
+                size=[C.obstacle_radius, 0.0, 0.0],
                 rgba=[0.75, 0.25, 0.2, 1.0],
                 contype=2,
                 conaffinity=2,
@@ -218,7 +238,7 @@ class Rocket(Task[RocketState]):
 
         def worth(position: np.ndarray) -> np.ndarray:
             still = np.zeros(len(position))
-            state = self._kinematic(still, position[:, [0, 2]], still)
+            state = self.kinematic(still, position[:, [0, 2]], still)
             reward: np.ndarray = self.reward(state, still, state)
             return reward
 
@@ -227,12 +247,12 @@ class Rocket(Task[RocketState]):
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """At the origin, at rest, upright (P).
 
-        Perturbed: position and angle, and their velocities, within `START_SPREAD`, uniform.
+        Perturbed: position and angle, and their velocities, within `start_spread`, uniform.
         """
         qpos, qvel = np.zeros((count, 3)), np.zeros((count, 3))
         if perturbed:
-            qpos = rng.uniform(-1.0, 1.0, (count, 3)) * START_SPREAD
-            qvel = rng.uniform(-1.0, 1.0, (count, 3)) * START_SPREAD
+            qpos = rng.uniform(-1.0, 1.0, (count, 3)) * C.start_spread
+            qvel = rng.uniform(-1.0, 1.0, (count, 3)) * C.start_spread
         return Start(np.zeros(count), qpos, qvel, np.zeros((count, 0)))
 
     def control(self, state: RocketState, action: Array) -> tuple[Array, Array]:
@@ -242,8 +262,8 @@ class Rocket(Task[RocketState]):
         main, side = action[..., 0], action[..., 1]
         force = xp.stack(
             [
-                xp.where(main >= DEAD_ZONE, MAIN_THRUST * main, 0.0),
-                xp.where(xp.abs(side) >= DEAD_ZONE, SIDE_THRUST * side, 0.0),
+                xp.where(main >= C.dead_zone, C.main_thrust * main, 0.0),
+                xp.where(xp.abs(side) >= C.dead_zone, C.side_thrust * side, 0.0),
             ],
             axis=-1,
         )
@@ -265,22 +285,22 @@ class Rocket(Task[RocketState]):
     def push_steps(self) -> tuple[int, ...]:
         """Spread evenly over the planner's flight: there is no cycle whose phases could matter,
         but there are a take-off, obstacles and an arrival."""
-        flight = self.horizon / HORIZON_RATIO
-        return tuple(int((index + 0.5) * flight / PUSHES) for index in range(PUSHES))
+        flight = self.horizon / C.horizon_ratio
+        return tuple(int((index + 0.5) * flight / C.pushes) for index in range(C.pushes))
 
     def ideal(self) -> RocketState:
         """At the planner's speed along each axis until there."""
         steps = np.arange(self.horizon + 1)
-        travelled = PLAN_STEP / PLAN_TIMESTEP * self.timestep * steps
+        travelled = C.plan_step / C.plan_timestep * self.timestep * steps
         position = np.minimum(travelled[:, None], self.goal)
-        return self._kinematic(steps * self.timestep, position, 0.0 * travelled)
+        return self.kinematic(steps * self.timestep, position, 0.0 * travelled)
 
-    def _kinematic(self, time: Array, position: Array, angle: Array) -> RocketState:
-        """A state without velocities, its clearance that of a disc around the hull."""
+    def kinematic(self, time: Array, position: Array, angle: Array) -> RocketState:
+        """A state at rest at positions (..., 2), its clearance that of a disc around the hull."""
         xp = array_namespace(position)
         clearance = [
-            xp.linalg.vector_norm(position - xp.asarray(obstacle), axis=-1)[..., None]
-            - (OBSTACLE_RADIUS + HULL_RADIUS)
+            xp.linalg.vector_norm(position - like(position, obstacle), axis=-1)[..., None]
+            - (C.obstacle_radius + C.hull_radius)
             for obstacle in self.obstacles
         ]
         return RocketState(
@@ -292,80 +312,22 @@ class Rocket(Task[RocketState]):
             clearance=xp.concat([position[..., :0], *clearance], axis=-1),
         )
 
-    # The planning variant
+    # The variants
 
-    def abstraction(self) -> Abstraction[RocketState]:
-        horizon = int(self.horizon * self.timestep / PLAN_TIMESTEP)
-
-        def start(count: int) -> RocketState:
-            zeros = np.zeros(count)
-            return self._kinematic(zeros, np.zeros((count, 2)), zeros)
-
-        def sample(rng: Rng, count: int) -> RocketState:
-            steps = rng.integers(0, horizon, count)
-            return self._kinematic(
-                steps * PLAN_TIMESTEP,
-                rng.uniform(*self.bounds, (count, 2)),
-                rng.uniform(-0.5, 0.5, count),
-            )
-
-        def advance(state: RocketState, action: Array) -> RocketState:
-            xp = array_namespace(action)
-            action = xp.clip(action, -1.0, 1.0)
-            return self._kinematic(
-                state.time + PLAN_TIMESTEP,
-                state.position + PLAN_STEP * action[..., :2],
-                state.angle + PLAN_TURN * action[..., 2],
-            )
-
-        def flatten(state: RocketState) -> Array:
-            xp = array_namespace(state.position)
-            return xp.concat([state.position, state.angle[..., None]], axis=-1)
-
-        def naive(state: RocketState) -> Array:
-            """Straight at the goal, past nothing."""
-            xp = array_namespace(state.position)
-            offset = (xp.asarray(self.goal) - state.position) / PLAN_STEP
-            longest = xp.max(xp.abs(offset), axis=-1)[..., None]
-            move = offset / xp.clip(longest, 1.0, None)
-            return xp.concat([move, 0.0 * longest], axis=-1)
-
-        def observation(state: RocketState) -> Array:
-            xp = array_namespace(state.position)
-            return xp.concat(
-                [state.position, wrap(state.angle)[..., None], self._towards_goal(state)], axis=-1
-            )
-
-        return Abstraction(
-            timestep=PLAN_TIMESTEP,
-            horizon=horizon,
-            action_size=3,
-            coordinates=("x", "z", "angle"),
-            start=start,
-            sample=sample,
-            advance=advance,
-            observation=observation,
-            observation_size=7,
-            flatten=flatten,
-            naive=naive,
-            poses=lambda states: states,
-        )
+    def abstraction(self) -> RocketAbstraction:
+        return RocketAbstraction(self)
 
     def reference(self, plan: Plan) -> ReferenceMotion:
         """The plan, interpolated linearly to the control rate."""
         steps = int(plan.times[-1] / self.timestep + 1e-9)
         times = np.arange(steps + 1) * self.timestep
         qpos = np.stack([np.interp(times, plan.times, column) for column in plan.states.T], axis=-1)
-        position = np.stack([qpos[:, 0], 0.0 * qpos[:, 0], qpos[:, 1]], axis=-1)
         return ReferenceMotion(
             task=self.name,
             task_version=self.version,
             timestep=self.timestep,
             qpos=qpos,
             qvel=np.gradient(qpos, self.timestep, axis=0),
-            feet=np.zeros((len(qpos), 0, 3)),
-            contacts=np.zeros((len(qpos), 0), dtype=bool),
-            com=position,
         )
 
     def audit(self, plan: Plan, reference: ReferenceMotion) -> Audit:
@@ -373,134 +335,138 @@ class Rocket(Task[RocketState]):
         final = float(np.linalg.norm(path[-1] - self.goal))
         speed = float(np.abs(np.diff(path, axis=0)).max() / plan.timestep)
         items = [
-            AuditItem("distance of the plan's end from the goal", final, SUCCESS_DISTANCE, "m"),
-            AuditItem("speed per axis", speed, PLAN_STEP / PLAN_TIMESTEP + 1e-6, "m/s"),
+            AuditItem("distance of the plan's end from the goal", final, C.success_distance, "m"),
+            AuditItem("speed per axis", speed, C.plan_step / C.plan_timestep + 1e-6, "m/s"),
         ]
         for number, obstacle in enumerate(self.obstacles, 1):
             nearest = float(np.linalg.norm(path - np.array(obstacle), axis=-1).min())
-            shortfall = max(0.0, OBSTACLE_RADIUS + HULL_RADIUS - nearest)
+            shortfall = max(0.0, C.obstacle_radius + C.hull_radius - nearest)
             items.append(
                 AuditItem(f"missing clearance from obstacle {number}", shortfall, 0.0, "m")
             )
         return Audit(tuple(items))
 
-    # The imitation variant
+    def tracker(self, reference: ReferenceMotion, form: str | None = None) -> RocketTracker:
+        """`paper` is the printed reward, `progress` a dense one (`RocketTracker`)."""
+        return RocketTracker(self, reference, self.imitation_form(form))
 
-    def tracker(self, reference: ReferenceMotion, form: str | None = None) -> Tracker[RocketState]:
-        """Rewards for following the reference's path, whatever the time.
 
-        `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
-        `progress` (default): the same with the sparse R replaced by
-        0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 1 m), where s of the path's length L lies before
-        xbar, and 1 for each metre by which the step raised s, up to 0.2 m (D). The printed form is
-        itself sparse when the goal is far. Without the exponential the last metres are worth about
-        1 % each, less than what leaving a steady hover costs, and without the pay for advancing
-        the same holds on the way: policies stop some metres short, or are slow. Felt over 4 m,
-        arriving is not worth the last metre. With pay for any speed they come in too fast to stop
-        (docs/calibration.md). Going forth gains at most what
-        going back has lost: to and fro does not pay.
-        """
-        form = self.imitation_form(form)
-        remaining = np.linalg.norm(reference.qpos[:, :2] - self.goal, axis=-1)
-        arrival = int(np.argmax(remaining < remaining.min() + 0.05))  # the rest is hovering
-        path = Path.through(reference.qpos[: max(arrival, 1) + 1, :2])
+class RocketAbstraction(Abstraction[RocketState]):
+    """Position and angle. An action changes them by at most 0.25 m per axis and 0.05 rad (P)."""
 
-        def reward(previous: RocketState, action: Array, state: RocketState) -> Array:
-            xp = array_namespace(state.position)
-            positions = xp.stack([previous.position, state.position])
-            (_, distance), (before, progress) = path.project(positions)
-            collision = xp.astype(self.violated(state), state.position.dtype)
-            penalty = TRACKING_PENALTY * collision
-            closeness = xp.exp(TRACKING_DECAY * distance)
-            if form == "paper":
-                return closeness * self.reward(previous, action, state) - penalty
-            length = path.lengths[-1]
-            remaining = (1.0 - progress) * length
-            worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / TRACKING_ARRIVAL)
-            advance = xp.clip((progress - before) * length, *TRACKING_LIMITS)
-            return closeness * worth + TRACKING_ADVANCE * advance - penalty
+    timestep = C.plan_timestep
+    action_size = 3
+    observation_size = 7
+    coordinates = ("x", "z", "angle")
 
-        def start(rng: Rng, count: int) -> Start:
-            # More often near the goal, where to stay pays and an early policy does not get.
-            frames = arrival - ((arrival + 1) * rng.uniform(size=count) ** 2).astype(int)
-            qpos = reference.qpos[frames].copy()
-            qvel = reference.qvel[frames] * rng.uniform(0.0, 1.0, (count, 1))
-            qpos[:, 2] = rng.uniform(-0.5, 0.5, count)
-            qvel[:, 2] = 0.0
-            from_start = self.start(rng, count)
-            first = rng.uniform(size=count) < 0.25  # evaluation starts here: practise it more
-            qpos[first], qvel[first] = from_start.qpos[first], from_start.qvel[first]
-            time = np.where(first, 0.0, frames * reference.timestep)
-            return Start(time, qpos, qvel, from_start.memory)
+    def __init__(self, task: Rocket) -> None:
+        self.task = task
+        self.horizon = int(task.horizon * task.timestep / C.plan_timestep)
 
-        best = TRACKING_ADVANCE * TRACKING_LIMITS[1]
-        return Tracker(
-            reward=reward,
-            max_reward=GOAL_WEIGHT if form == "paper" else 1.0 + best,
-            terminal=self.terminal,
-            start=start,
-            horizon=self.horizon,
+    def start(self, count: int) -> RocketState:
+        zeros = np.zeros(count)
+        return self.task.kinematic(zeros, np.zeros((count, 2)), zeros)
+
+    def sample(self, rng: Rng, count: int) -> RocketState:
+        steps = rng.integers(0, self.horizon, count)
+        return self.task.kinematic(
+            steps * C.plan_timestep,
+            rng.uniform(*self.task.bounds, (count, 2)),
+            rng.uniform(-0.5, 0.5, count),
         )
 
+    def advance(self, state: RocketState, action: Array) -> RocketState:
+        xp = array_namespace(action)
+        action = xp.clip(action, -1.0, 1.0)
+        return self.task.kinematic(
+            state.time + C.plan_timestep,
+            state.position + C.plan_step * action[..., :2],
+            state.angle + PLAN_TURN * action[..., 2],
+        )
 
-@dataclass(frozen=True)
-class Path:
-    """A polyline with many short segments of similar length.
+    def observation(self, state: RocketState) -> Array:
+        xp = array_namespace(state.position)
+        return xp.concat(
+            [state.position, wrap(state.angle)[..., None], self.task.towards_goal(state)], axis=-1
+        )
 
-    Attributes:
-        vertices: metres, shape (n, 2).
-        lengths: metres from the first vertex to each, shape (n,).
+    def flatten(self, state: RocketState) -> Array:
+        xp = array_namespace(state.position)
+        return xp.concat([state.position, state.angle[..., None]], axis=-1)
+
+    def naive(self, state: RocketState) -> Array:
+        """Straight at the goal, past nothing."""
+        xp = array_namespace(state.position)
+        offset = (like(state.position, self.task.goal) - state.position) / C.plan_step
+        longest = xp.max(xp.abs(offset), axis=-1)[..., None]
+        move = offset / xp.clip(longest, 1.0, None)
+        return xp.concat([move, 0.0 * longest], axis=-1)
+
+    def poses(self, coordinates: np.ndarray) -> np.ndarray:
+        return coordinates
+
+
+class RocketTracker(Tracker[RocketState]):
+    """Rewards for following the reference's path, whatever the time.
+
+    `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
+    `progress`: the same with the sparse R replaced by 0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 1 m),
+    where s of the path's length L lies before xbar, and 1 for each metre by which the step raised
+    s, up to 0.2 m (D). docs/calibration.md says what each part is for. Going forth gains at most
+    what going back has lost: to and fro does not pay.
     """
 
-    vertices: np.ndarray
-    lengths: np.ndarray
+    def __init__(self, task: Rocket, reference: ReferenceMotion, form: str) -> None:
+        self.task = task
+        self.form = form
+        self.reference = reference
+        self.horizon = task.horizon
+        best = 1.0 + TRACKING_ADVANCE * TRACKING_LIMITS[1]
+        self.max_reward = task.max_reward if form == "paper" else best
+        remaining = np.linalg.norm(reference.qpos[:, :2] - task.goal, axis=-1)
+        # The rest is hovering.
+        self._arrival = int(np.argmax(remaining < remaining.min() + 0.05))
+        self._path = Path.through(reference.qpos[: max(self._arrival, 1) + 1, :2])
 
-    @classmethod
-    def through(cls, points: np.ndarray) -> Path:
-        moved = np.linalg.norm(np.diff(points, axis=0), axis=-1)
-        keep = np.concatenate([[True], moved > 1e-9])
-        return cls(points[keep], np.concatenate([[0.0], np.cumsum(moved[moved > 1e-9])]))
+    def reward(self, previous: RocketState, action: Array, state: RocketState) -> Array:
+        xp = array_namespace(state.position)
+        positions = xp.stack([previous.position, state.position])
+        (_, distance), (before, progress) = self._path.project(positions)
+        collision = xp.astype(self.task.collided(state), state.position.dtype)
+        penalty = TRACKING_PENALTY * collision
+        closeness = xp.exp(TRACKING_DECAY * distance)
+        if self.form == "paper":
+            return closeness * self.task.reward(previous, action, state) - penalty
+        length = float(self._path.lengths[-1])
+        remaining = (1.0 - progress) * length
+        worth = 0.1 + 0.5 * progress + 0.4 * xp.exp(-remaining / TRACKING_ARRIVAL)
+        advance = xp.clip((progress - before) * length, *TRACKING_LIMITS)
+        return closeness * worth + TRACKING_ADVANCE * advance - penalty
 
-    def project(self, position: Array) -> tuple[Array, Array]:
-        """Distance to the nearest point in metres and the share of the path before it.
+    def terminal(self, state: RocketState) -> Array:
+        return self.task.terminal(state)
 
-        Only the two segments at the nearest vertex are looked at: with short, similar segments
-        another one cannot be nearer by more than a fraction of a segment.
-        """
-        xp = array_namespace(position)
-        vertices, lengths = xp.asarray(self.vertices), xp.asarray(self.lengths)
-        if len(self.vertices) == 1:
-            distance = xp.linalg.vector_norm(position - vertices[0], axis=-1)
-            return distance, 0.0 * distance
-        # |p - v|^2 less |p|^2, which does not change the order. Summed by hand: a matrix product
-        # would round differently for one position than for many.
-        squared = (
-            xp.sum(vertices * vertices, axis=-1)
-            - 2.0 * position[..., None, 0] * vertices[:, 0]
-            - 2.0 * position[..., None, 1] * vertices[:, 1]
-        )
-        nearest = xp.argmin(squared, axis=-1)[..., None] + xp.asarray([-1, 0])
-        index = xp.clip(nearest, 0, len(self.vertices) - 2)  # of two segments, shape (..., 2)
-        a, b = vertices[index], vertices[index + 1]
-        along = b - a
-        length = lengths[index + 1] - lengths[index]
-        position = position[..., None, :]
-        share = xp.sum((position - a) * along, axis=-1) / (length * length)
-        share = xp.clip(share, 0.0, 1.0)
-        distance = xp.linalg.vector_norm(position - (a + share[..., None] * along), axis=-1)
-        travelled = (lengths[index] + share * length) / lengths[-1]
-        first = distance[..., 0] <= distance[..., 1]
-        return (
-            xp.where(first, distance[..., 0], distance[..., 1]),
-            xp.where(first, travelled[..., 0], travelled[..., 1]),
-        )
+    def start(self, rng: Rng, count: int) -> Start:
+        reference, arrival = self.reference, self._arrival
+        # More often near the goal, where to stay pays and an early policy does not get.
+        frames = arrival - ((arrival + 1) * rng.uniform(size=count) ** 2).astype(int)
+        qpos = reference.qpos[frames].copy()
+        qvel = reference.qvel[frames] * rng.uniform(0.0, 1.0, (count, 1))
+        qpos[:, 2] = rng.uniform(-0.5, 0.5, count)
+        qvel[:, 2] = 0.0
+        from_start = self.task.start(rng, count)
+        first = rng.uniform(size=count) < 0.25  # evaluation starts here: practise it more
+        qpos[first], qvel[first] = from_start.qpos[first], from_start.qvel[first]
+        time = np.where(first, 0.0, frames * reference.timestep)
+        return Start(time, qpos, qvel, from_start.memory)
 
 
 def _rocket(name: str, distance: float, obstacles: tuple[tuple[float, float], ...]) -> Rocket:
-    if not 2.0 * SUCCESS_DISTANCE < distance < 1e4:
-        raise ValueError(f"the distance must lie between {2.0 * SUCCESS_DISTANCE} and 10000 m")
-    flight = distance * math.cos(DIRECTION) / (PLAN_STEP / PLAN_TIMESTEP)
-    horizon = round(HORIZON_RATIO * flight / CONTROL_TIMESTEP)
+    least = 2.0 * C.success_distance
+    if not least < distance < 1e4:
+        raise ValueError(f"the distance must lie between {least} and 10000 m")
+    flight = distance * math.cos(C.direction) / (C.plan_step / C.plan_timestep)
+    horizon = round(C.horizon_ratio * flight / C.control_timestep)
     return Rocket(name=name, distance=float(distance), obstacles=obstacles, horizon=horizon)
 
 
@@ -512,7 +478,7 @@ def rocket_navigation(distance: float = 60.0) -> Rocket:
 @register("rocket_obstacles")
 def rocket_obstacles(distance: float = 60.0) -> Rocket:
     """Two obstacles a third and two thirds of the way, a metre to either side of the line."""
-    line = np.array([math.cos(DIRECTION), math.sin(DIRECTION)])
+    line = np.array([math.cos(C.direction), math.sin(C.direction)])
     left = np.array([-line[1], line[0]])
     centres = (distance / 3 * line + left, distance * 2 / 3 * line - left)
     obstacles = tuple((float(x), float(z)) for x, z in centres)

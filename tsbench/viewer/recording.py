@@ -11,15 +11,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tsbench.errors import TsbenchError
 from tsbench.evaluation.evaluate import check_fit
-from tsbench.mdp import Readings, S, State, Task
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.model import sensor_slices
 from tsbench.sim.push import Push
+from tsbench.state import Readings, S, State
+from tsbench.task import Task, plannable
 
 Array = NDArray[np.float64]
 
@@ -146,19 +146,11 @@ def record_motion(task: Task[Any], motion: ReferenceMotion) -> Recording:
     """A motion as if the physics followed it exactly: no forces, no actions.
 
     Raises:
-        TsbenchError: the motion is for another task or version, or at another rate.
+        TsbenchError: the motion does not fit the task.
     """
-    if (motion.task, motion.task_version) != (task.name, task.version):
-        raise TsbenchError(
-            f"the reference motion is for {motion.task} version {motion.task_version}, "
-            f"not for {task.name} version {task.version}"
-        )
+    plannable(task).check_fit(motion)
     model = task.spec().compile()
     data = mujoco.MjData(model)
-    if motion.qpos.shape[1] != model.nq or motion.qvel.shape[1] != model.nv:
-        raise TsbenchError(
-            f"the plan motion has shape {motion.qpos.shape}, this model needs (frames, {model.nq})"
-        )
     sensors = np.zeros((len(motion.qpos), model.nsensordata))
     for row, qpos, qvel in zip(sensors, motion.qpos, motion.qvel, strict=True):
         data.qpos[:], data.qvel[:] = qpos, qvel

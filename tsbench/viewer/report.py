@@ -15,6 +15,7 @@ from tsbench import record, tables
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.score import Score
 from tsbench.motion import Plan
+from tsbench.task import plannable
 from tsbench.viewer import charts, page
 from tsbench.viewer.compose import foot_bands
 from tsbench.viewer.recording import Recording, record_episode
@@ -156,8 +157,9 @@ def _tables(run: Subject, directory: Path) -> Iterator[str]:
     path = directory / record.PLAN
     if path.exists() and run.reference is not None:
         plan = Plan.load(path)
-        run.task.check_fit(plan)
-        audit = run.task.audit(plan, run.reference)
+        task = plannable(run.task)
+        task.check_fit(plan)
+        audit = task.audit(plan, run.reference)
         items = [
             (item.what, f"{item.value:.3g} {item.unit}", f"{item.limit:.3g} {item.unit}",
              "ok" if item.passed else "too much")

@@ -11,12 +11,13 @@ import numpy as np
 
 from tsbench import record, tables, tasks
 from tsbench.errors import TsbenchError
-from tsbench.mdp import Task
 from tsbench.motion import Plan, ReferenceMotion, read_motion
 from tsbench.policy import Policy
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.push import Push
+from tsbench.task import Task, plannable
 from tsbench.viewer.compose import compose, compose_pair, compose_plan
+from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.recording import Recording, record_episode, record_motion
 from tsbench.viewer.show import Show
 
@@ -42,20 +43,24 @@ class Subject:
     def plan(self) -> Recording | None:
         return None if self.reference is None else record_motion(self.task, self.reference)
 
-    def show(self, push: Push | None = None) -> Show:
+    def show(self, push: str | None = None) -> Show:
         """
+        Args:
+            push: on the robot, as `parse_push` reads it.
+
         Raises:
-            TsbenchError: a push on what no policy holds up or after the end, or a policy for
-                another task.
+            TsbenchError: a push on what no policy holds up, after the end or out of the task's
+                plane, or a policy for another task.
         """
+        force = None if push is None else parse_push(push, self.task)
         plan = self.plan()
         if self.policy is None:
-            if push is not None:
+            if force is not None:
                 raise TsbenchError("only what a policy executes can be pushed, not a plan")
             assert plan is not None
             return compose_plan(plan, title=self.title, verdict=planned_in_words(plan))
-        recording = record_episode(self.task, self.policy, push)
-        check_pushed(push, [recording])
+        recording = record_episode(self.task, self.policy, force)
+        check_pushed(force, [recording])
         return self.show_of(recording, plan)
 
     def show_of(self, recording: Recording, plan: Recording | None) -> Show:
@@ -85,7 +90,8 @@ def subject(word: str) -> Subject:
 def task_subject(task: Task[Any]) -> Subject:
     """A task, shown by the plan that its hand-made planner makes."""
     title = f"{task.name}, planned by hand"
-    return Subject(title, task, None, task.reference(naive_plan(task)))
+    planned = plannable(task)
+    return Subject(title, task, None, planned.reference(naive_plan(planned)))
 
 
 def run_subject(directory: Path, score: record.Record | None = None) -> Subject:
@@ -104,7 +110,7 @@ def run_subject(directory: Path, score: record.Record | None = None) -> Subject:
     path = directory / record.REFERENCE
     reference = ReferenceMotion.load(path) if path.exists() else None
     if reference is not None:
-        task.check_fit(reference)
+        plannable(task).check_fit(reference)
     return Subject(
         title=tables.run_title(score) if score else task.name,
         task=task,
@@ -124,14 +130,14 @@ def plan_subject(path: Path) -> Subject:
     constants = {}
     if (path.parent / record.CONFIG).exists():
         constants = record.read_config(path.parent).task.constants
-    task = tasks.make(motion.task, **constants)
+    task = plannable(tasks.make(motion.task, **constants))
     task.check_fit(motion)
     if isinstance(motion, Plan):
         motion = task.reference(motion)
     return Subject(f"{task.name}, {path.name}", task, None, motion)
 
 
-def pair(runs: Sequence[str], push: Push | None = None) -> Show:
+def pair(runs: Sequence[str], push: str | None = None) -> Show:
     """Two runs of one task beside each other.
 
     Raises:
@@ -139,8 +145,9 @@ def pair(runs: Sequence[str], push: Push | None = None) -> Show:
             the end of both.
     """
     subjects = [run_subject(Path(word)) for word in runs]
-    recordings = [record_episode(s.task, cast(Policy, s.policy), push) for s in subjects]
-    check_pushed(push, recordings)
+    force = None if push is None else parse_push(push, subjects[0].task)
+    recordings = [record_episode(s.task, cast(Policy, s.policy), force) for s in subjects]
+    check_pushed(force, recordings)
     verdict = " ".join(
         f"{name} is {one.title}. {executed_in_words(recording)}"
         for name, one, recording in zip("AB", subjects, recordings, strict=True)

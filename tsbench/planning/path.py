@@ -1,0 +1,66 @@
+"""Paths: polylines that a motion follows, whatever the time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tsbench.arrays import Array, array_namespace, like
+
+_BEFORE_AND_AFTER = np.array([-1, 0])  # the segments at a vertex
+
+
+@dataclass(frozen=True)
+class Path:
+    """A polyline with many short segments of similar length.
+
+    Attributes:
+        vertices: metres, shape (n, 2).
+        lengths: metres from the first vertex to each, shape (n,).
+    """
+
+    vertices: np.ndarray
+    lengths: np.ndarray
+
+    @classmethod
+    def through(cls, points: np.ndarray) -> Path:
+        """The polyline through points in metres, shape (n, 2), without those that repeat."""
+        moved = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+        keep = np.concatenate([[True], moved > 1e-9])
+        return cls(points[keep], np.concatenate([[0.0], np.cumsum(moved[moved > 1e-9])]))
+
+    def project(self, position: Array) -> tuple[Array, Array]:
+        """Distance to the nearest point in metres and the share of the path before it, each of
+        shape (...,), for positions in metres, shape (..., 2).
+
+        Only the two segments at the nearest vertex are looked at: with short, similar segments
+        another one cannot be nearer by more than a fraction of a segment.
+        """
+        xp = array_namespace(position)
+        vertices, lengths = like(position, self.vertices), like(position, self.lengths)
+        if len(self.vertices) == 1:
+            distance = xp.linalg.vector_norm(position - vertices[0], axis=-1)
+            return distance, 0.0 * distance
+        # |p - v|^2 less |p|^2, which does not change the order. Summed by hand: a matrix product
+        # would round differently for one position than for many.
+        squared = (
+            xp.sum(vertices * vertices, axis=-1)
+            - 2.0 * position[..., None, 0] * vertices[:, 0]
+            - 2.0 * position[..., None, 1] * vertices[:, 1]
+        )
+        nearest = xp.argmin(squared, axis=-1)[..., None] + like(position, _BEFORE_AND_AFTER)
+        index = xp.clip(nearest, 0, len(self.vertices) - 2)  # of two segments, shape (..., 2)
+        a, b = vertices[index], vertices[index + 1]
+        along = b - a
+        length = lengths[index + 1] - lengths[index]
+        position = position[..., None, :]
+        share = xp.sum((position - a) * along, axis=-1) / (length * length)
+        share = xp.clip(share, 0.0, 1.0)
+        distance = xp.linalg.vector_norm(position - (a + share[..., None] * along), axis=-1)
+        travelled = (lengths[index] + share * length) / lengths[-1]
+        first = distance[..., 0] <= distance[..., 1]
+        return (
+            xp.where(first, distance[..., 0], distance[..., 1]),
+            xp.where(first, travelled[..., 0], travelled[..., 1]),
+        )
