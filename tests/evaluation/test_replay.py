@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +104,46 @@ def test_the_constants_hash(monkeypatch: pytest.MonkeyPatch) -> None:
     assert before == constants_hash(tasks.make("rocket_obstacles"))
 
 
+@dataclass(frozen=True)
+class Bounds:
+    """What a task may have among its constants."""
+
+    speed: float
+    names: tuple[str, ...]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"decay": -11.0},
+        {"steps": 4},
+        {"bounds": Bounds(1.0, ("x", "z"))},
+        {"table": {"0.5": Bounds(2.0, ("x",))}},
+        {"another": 0},
+    ],
+)
+def test_the_constants_hash_is_of_what_the_task_says(
+    changed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is nested, in any order; the names of its module's constants do not count."""
+    constants = {
+        "decay": -10.0,
+        "steps": 3,
+        "bounds": Bounds(1.0, ("x", "y")),
+        "table": {"0.5": Bounds(1.0, ("x",))},
+    }
+    assert constants_hash(TASK) == constants_hash(tasks.make("laikago_trot", distance=0.4))
+    assert constants_hash(TASK) != constants_hash(tasks.make("laikago_trot"))
+    monkeypatch.setattr(type(TASK), "constants", lambda _: constants)
+    before = constants_hash(TASK)
+    monkeypatch.setattr("tsbench.tasks.laikago.A_NEW_ONE", 1.0, raising=False)
+    assert constants_hash(TASK) == before
+    monkeypatch.setattr(type(TASK), "constants", lambda _: dict(reversed(constants.items())))
+    assert constants_hash(TASK) == before
+    monkeypatch.setattr(type(TASK), "constants", lambda _: constants | changed)
+    assert constants_hash(TASK) != before
+
+
 def test_bit_for_bit(score: Score, log: ActionLog) -> None:
     found = compare(score, score, TASK, log)
     assert (found.kind, found.agrees) == ("exact", True)
@@ -120,7 +160,9 @@ def test_bit_for_bit(score: Score, log: ActionLog) -> None:
     ("changes", "words"),
     [
         ({"protocol": replace(PROTOCOL, name="v1")}, "another protocol (v1, not smoke)"),
-        ({"protocol": replace(PROTOCOL, seed=1)}, "other numbers in the protocol"),
+        ({"protocol": replace(PROTOCOL, seed=1)}, "another seed"),
+        ({"protocol": replace(PROTOCOL, perturbed=5)}, "other numbers in the protocol"),
+        ({"protocol": replace(PROTOCOL, perturbed=5, seed=1)}, "other numbers in the protocol"),
         ({"task": "laikago_walk"}, "another task (laikago_walk, not laikago_trot)"),
         ({"task_version": 0}, "another version of the task (0, not 1)"),
         ({"mjcf": "0"}, "another MJCF"),

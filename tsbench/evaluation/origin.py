@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -32,7 +32,7 @@ class Origin:
         task_version: of it.
         mjcf: hash of the task's MJCF (`sim.model.fingerprint`).
         model: hash of what mujoco compiled it to.
-        constants: sha256 of the values that define the task.
+        constants: sha256 of the values that define the task (`Task.constants`).
         policy: sha256 of the policy file, or None where there is none.
         packages: versions, Python's too.
         machine: what chooses kernels: architecture, vector extensions, BLAS, C library.
@@ -83,6 +83,7 @@ def machine() -> dict[str, str]:
 
 
 def constants_hash(task: Task[Any]) -> str:
-    """sha256 of what a task says that decides its scores (`Task.constants`)."""
-    content = json.dumps(dict(task.constants()), sort_keys=True)
+    """sha256 of `Task.constants`, in which numbers, strings, tuples, mappings and dataclasses may
+    be nested."""
+    content = json.dumps(dict(task.constants()), sort_keys=True, default=asdict)
     return hashlib.sha256(content.encode()).hexdigest()

@@ -116,14 +116,16 @@ def compare(kept: Score, again: Score, task: Task[Any], log: ActionLog | None) -
 
 def _incomparable(before: Origin, now: Origin) -> str:
     """What two scores do not have in common that makes them scores of different things."""
+    protocol = replace(now.protocol, seed=before.protocol.seed)
     named: list[tuple[str, object, object]] = [
         ("another protocol", before.protocol.name, now.protocol.name),
         ("another task", before.task, now.task),
         ("another version of the task", before.task_version, now.task_version),
         ("another mujoco", before.packages.get("mujoco"), now.packages["mujoco"]),
     ]
-    hashed: list[tuple[str, object, object]] = [
-        ("other numbers in the protocol", before.protocol, now.protocol),
+    unnamed: list[tuple[str, object, object]] = [  # long, or a seed that may be secret
+        ("other numbers in the protocol", before.protocol, protocol),
+        ("another seed", before.protocol.seed, now.protocol.seed),
         ("another policy", before.policy, now.policy),
         ("another MJCF", before.mjcf, now.mjcf),
         ("another model", before.model, now.model),
@@ -132,7 +134,7 @@ def _incomparable(before: Origin, now: Origin) -> str:
     for words, there, here in named:
         if there != here:
             return f"{words} ({there}, not {here})"
-    return next((words for words, there, here in hashed if there != here), "")
+    return next((words for words, there, here in unnamed if there != here), "")
 
 
 def differences(kept: Score, again: Score, best: float) -> list[str]:
