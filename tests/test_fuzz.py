@@ -14,13 +14,14 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsbench import config, record, run, tables, tasks
+from tsbench import config, run, tables, tasks
 from tsbench.checkpoint import Checkpoints
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.evaluate import check_fit
 from tsbench.files import write_json
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.policy import Policy, PolicyInfo
+from tsbench.record import Record, RunDirectory
 
 NAME = "rocket_navigation"
 
@@ -71,7 +72,7 @@ def intact(
     tmp_path_factory: pytest.TempPathFactory,
     naive_plan: Callable[[str], Plan],
     naive_reference: Callable[[str], ReferenceMotion],
-    invented_record: Callable[[str], record.Record],
+    invented_record: Callable[[str], Record],
 ) -> Path:
     """A run directory with something of everything in it. Not to be changed."""
     folder = tmp_path_factory.mktemp("intact")
@@ -96,13 +97,14 @@ def intact(
 
 
 def read_score(folder: Path) -> None:
-    content = record.read_score(folder)
+    content = RunDirectory(folder).record()
     assert tables.run_title(content)
     assert tables.summary(content.score)
 
 
 def read_policy(folder: Path) -> None:
-    policy, task = record.read_policy(folder)
+    policy = RunDirectory(folder).policy()
+    task = RunDirectory(folder).task(policy.info.task)
     right_or_refused(lambda: check_fit(policy, task))
     assert np.isfinite(policy(np.zeros((2, policy.info.layers[0])))).all()
 
@@ -112,7 +114,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "reference.npz": lambda folder: ReferenceMotion.load(folder / "reference.npz"),
     "policy.safetensors": read_policy,
     "policy.json": read_policy,
-    "config.yaml": lambda folder: run.prepare(record.read_config(folder)),
+    "config.yaml": lambda folder: run.prepare(RunDirectory(folder).config()),
     "score.json": read_score,
 }
 

@@ -24,7 +24,7 @@ CORE = (
 MAY_KNOW: dict[str, set[str]] = {
     **{module: set(CORE[:number]) for number, module in enumerate(CORE)},
     "gl": {"errors"},
-    "curves": {"errors"},
+    "curves": {"errors", "files"},
     "conf": set(),
     "planning": {*CORE},
     "checkpoint": {*CORE},
@@ -40,10 +40,10 @@ MAY_KNOW: dict[str, set[str]] = {
     "tables": {"evaluation", "record"},
     "workspace": {*CORE, "checkpoint", "record", "tables"},
     "run": {
-        *CORE, "sim", "tasks", "evaluation", "rl", "methods", "viewer", "config", "record",
-        "tables", "workspace", "curves",
+        *CORE, "sim", "tasks", "evaluation", "rl", "methods", "config", "record", "tables",
+        "workspace",
     },
-    "launch": {*CORE, "config", "record", "run"},
+    "launch": {*CORE, "config", "record", "tables", "viewer", "run"},
     "bench": {*CORE, "sim", "tasks", "rl", "methods", "config", "record", "workspace", "run"},
 }  # fmt: skip
 ROOFS = {"cli", "gym", "tsbench"}  # the commands and the public faces: they may know everything

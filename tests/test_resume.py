@@ -19,11 +19,12 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tsbench import cli, config, record, run, tasks
+from tsbench import cli, config, run, tasks
 from tsbench.checkpoint import Checkpoints, decode, encode
 from tsbench.errors import Stopped, TsbenchError
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import Policy
+from tsbench.record import RunDirectory
 from tsbench.rl.ppo import Learner, PPOSettings
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
@@ -47,6 +48,7 @@ WORDS = [
     "checkpoint=0",
 ]
 ITERATIONS = 3 + 2 + 2
+PAGES = {"learning_curves.png", "view.html", "report.html"}
 
 
 class Crash(BaseException):
@@ -88,9 +90,10 @@ def crash(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, bool], None]:
 
 
 def result(directory: Path) -> dict[str, Any]:
-    """All that a run leaves, but for how long things took."""
+    """All that a run leaves, but for how long things took, and for the pages that the command line
+    makes of it."""
     rows = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
-    content = record.read_score(directory)
+    content = RunDirectory(directory).record()
     recordings = [dict(np.load(directory / f"{name}.npz")) for name in ("plan", "reference")]
     events = EventAccumulator(str(directory / "tensorboard"))
     events.Reload()
@@ -113,7 +116,7 @@ def result(directory: Path) -> dict[str, Any]:
         "events": scalars,
         "score": content.score,
         "stages": [(stage.name, stage.steps, stage.physics_substeps) for stage in content.stages],
-        "files": sorted(path.name for path in directory.iterdir()),
+        "files": sorted({path.name for path in directory.iterdir()} - PAGES),
     }
 
 
@@ -239,11 +242,10 @@ def test_a_torn_checkpoint_is_told_and_the_one_before_is_used(
 
 
 def test_nothing_is_left_of_what_was_half_written(unfinished: Path) -> None:
-    for name in ("policy.json.part", "checkpoints/00-plan.part", "view.html"):
+    for name in ("policy.json.part", "checkpoints/00-plan.part"):
         (unfinished / name).write_text("half")
     resume(unfinished)
     assert not list(unfinished.rglob("*.part"))
-    assert (unfinished / "view.html").read_text() != "half"
     assert not (unfinished / "checkpoints").exists()
 
 
@@ -255,7 +257,7 @@ def test_the_log_and_the_score_tell_of_the_interruption(unfinished: Path) -> Non
     log = (unfinished / "log.txt").read_text()
     assert "resumed: imitate goes on at 32 steps" in log
     assert "2 iterations after the last checkpoint are done again" in log
-    stages = record.read_score(unfinished).stages
+    stages = RunDirectory(unfinished).record().stages
     assert [stage.interruptions for stage in stages] == [0, 1, 0]
     assert stages[1].seconds > before["seconds"]
 
@@ -334,9 +336,11 @@ def test_what_cannot_be_resumed(
 
 
 def test_a_finished_run_is_not_resumed(
-    uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+    uninterrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["run", f"resume={uninterrupted}"]) == 2
+    shutil.copytree(uninterrupted, tmp_path / "run")
+    (tmp_path / "run" / "report.html").touch()
+    assert cli.main(["run", f"resume={tmp_path / 'run'}"]) == 2
     assert capsys.readouterr().err.endswith("a finished run: there is nothing to resume\n")
 
 
@@ -371,7 +375,6 @@ def test_a_signal_saves_the_iteration_and_says_how_to_go_on(
 ) -> None:  # fmt: skip
     """In the middle of the fifth iteration, with no other checkpoint due."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["tsbench"])
     words = [*WORDS[:-1], "checkpoint=1000"]
     step, steps = BatchedEnvironment.step, [0]
 
@@ -390,6 +393,7 @@ def test_a_signal_saves_the_iteration_and_says_how_to_go_on(
     assert names[-1].startswith("01-imitate-000000000064-")
     assert cli.main(["run", "resume=run"]) == 0
     assert result(tmp_path / "run") == result(uninterrupted)
+    assert {path.name for path in (tmp_path / "run").iterdir()} >= PAGES
 
 
 def test_a_second_signal_does_not_wait(tmp_path: Path) -> None:

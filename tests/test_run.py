@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,9 +24,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tsbench import cli, config, launch, record, run, tables, tasks
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.protocol import PROTOCOLS, SMOKE
-from tsbench.motion import Plan, ReferenceMotion
+from tsbench.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.policy import Policy
-from tsbench.record import Stage
+from tsbench.record import RunDirectory, Stage
 from tsbench.sim.model import compiled_hash, fingerprint
 from tsbench.workspace import RunWorkspace
 
@@ -37,10 +39,12 @@ def plain(content: Any) -> Any:
 
 
 def execute(directory: Path, words: list[str] = WORDS) -> str:
-    """Makes a run and returns what it showed."""
+    """Makes a run with its pages and returns what it showed."""
     chosen = replace(config.compose(words), directory=str(directory))
     with (directory.parent / "out").open("w+") as file:
-        run.execute(chosen, words, Console(file=file, width=100))
+        console = Console(file=file, width=100)
+        run.execute(chosen, words, console)
+        launch.finish(directory, console)
         file.seek(0)
         return file.read()
 
@@ -60,23 +64,30 @@ def finished(shown: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.Monkey
     return Path("one")
 
 
+EVERYTHING = {
+    "actions.npz",
+    "config.yaml",
+    "learning_curves.png",
+    "log.txt",
+    "metrics.jsonl",
+    "plan.npz",
+    "policy.json",
+    "policy.safetensors",
+    "reference.npz",
+    "report.html",
+    "score.json",
+    "tensorboard",
+    "versions.json",
+    "view.html",
+}
+
+
+def names(directory: Path) -> set[str]:
+    return {path.name for path in directory.iterdir()}
+
+
 def test_the_directory_holds_everything(shown: tuple[Path, str]) -> None:
-    assert {path.name for path in shown[0].iterdir()} == {
-        "actions.npz",
-        "config.yaml",
-        "learning_curves.png",
-        "log.txt",
-        "metrics.jsonl",
-        "plan.npz",
-        "policy.json",
-        "policy.safetensors",
-        "reference.npz",
-        "report.html",
-        "score.json",
-        "tensorboard",
-        "versions.json",
-        "view.html",
-    }
+    assert names(shown[0]) == EVERYTHING
 
 
 def test_the_config_repeats_the_run(shown: tuple[Path, str]) -> None:
@@ -84,7 +95,7 @@ def test_the_config_repeats_the_run(shown: tuple[Path, str]) -> None:
     text = (directory / "config.yaml").read_text()
     assert text.startswith(f"# tsbench run {' '.join(WORDS)}\n")
     composed = replace(config.compose(WORDS), directory=str(directory))
-    assert record.read_config(directory) == composed
+    assert RunDirectory(directory).config() == composed
     assert yaml.safe_load(text)["seed"] == 3
 
 
@@ -98,7 +109,7 @@ def test_versions_and_hashes(shown: tuple[Path, str]) -> None:
 
 
 def test_the_score_says_what_each_stage_used(shown: tuple[Path, str]) -> None:
-    content = record.read_score(shown[0])
+    content = RunDirectory(shown[0]).record()
     assert (content.task, content.method) == ("rocket_navigation", "twostage")
     assert content.standard is True
     assert 0.0 <= content.score.normalized_reward <= 1.0
@@ -156,7 +167,7 @@ def test_the_same_seed_gives_the_same_bits(finished: Path, tmp_path: Path) -> No
     execute(tmp_path / "two")
     for name in ("policy.safetensors", "policy.json"):
         assert (finished / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-    first, second = record.read_score(finished), record.read_score(tmp_path / "two")
+    first, second = RunDirectory(finished).record(), RunDirectory(tmp_path / "two").record()
     assert first.score == second.score
     one, two = Plan.load(finished / "plan.npz"), Plan.load(tmp_path / "two" / "plan.npz")
     np.testing.assert_array_equal(one.states, two.states)
@@ -177,7 +188,7 @@ def test_evaluate_repeats_the_score(finished: Path, capsys: pytest.CaptureFixtur
     assert comparison == {
         "kind": "exact", "agrees": True, "words": "compared bit for bit: equal",
     }  # fmt: skip
-    assert shown == plain(record.shown(record.read_score(finished)))
+    assert shown == plain(record.shown(RunDirectory(finished).record()))
     assert {"normalized_reward", "robustness", "stages"} <= shown.keys()
 
 
@@ -190,7 +201,7 @@ def test_evaluate_needs_the_policy_file_alone(
     words = ["evaluate", "bare", "--protocol", "smoke", "--threads", "1", "--json", "bare.json"]
     assert cli.main(words) == 0
     assert "score.json" not in capsys.readouterr().out
-    score = plain(record.read_score(finished).score.as_dict())
+    score = plain(RunDirectory(finished).record().score.as_dict())
     assert json.loads(Path("bare.json").read_text()) == {**score, "standard": True}
 
 
@@ -230,14 +241,13 @@ def test_a_kept_run_is_an_entry(
     assert cli.main([*keep, "board/entry"]) == 0
     assert "kept in board/entry" in capsys.readouterr().out
     entry = Path("board/entry")
-    names = {
+    assert names(entry) == {
         "actions.npz", "config.yaml", "plan.npz", "policy.json", "policy.safetensors",
         "reference.npz", "score.json", "versions.json",
     }  # fmt: skip
-    assert {path.name for path in entry.iterdir()} == names
-    for name in names - {"score.json", "actions.npz"}:
+    for name in names(entry) - {"score.json", "actions.npz"}:
         assert (entry / name).read_bytes() == (finished / name).read_bytes()
-    kept, before = record.read_score(entry), record.read_score(finished)
+    kept, before = RunDirectory(entry).record(), RunDirectory(finished).record()
     assert replace(kept, score=before.score) == before
     assert kept.score.robustness == before.score.robustness
     assert kept.score.origin.protocol == PROTOCOLS[quick]
@@ -249,10 +259,45 @@ def test_a_kept_run_is_an_entry(
     assert "board/entry/score.json/x: Not a directory" in capsys.readouterr().err
     assert cli.main(["evaluate", "one", "--keep", "other"]) == 2
     assert "a score by protocol smoke cannot be an entry" in capsys.readouterr().err
-    (finished / "plan.npz").unlink()
+    (finished / "versions.json").unlink()
     assert cli.main([*keep, "other"]) == 2
-    assert "one is no finished two-stage run: it lacks plan.npz" in capsys.readouterr().err
+    assert "one is no finished run: it lacks versions.json" in capsys.readouterr().err
     assert not Path("other").exists()
+
+
+def test_a_run_of_any_method_can_be_kept(
+    quick: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a plan, as one that learns to act directly, and with its pages made of the entry."""
+    monkeypatch.chdir(tmp_path)
+    words = ["task=rocket_navigation", "method=monolithic", "budget=smoke"]
+    assert cli.main(["run", *words, "task.budgets.smoke.act=512", "directory=one"]) == 0
+    assert names(Path("one")) == EVERYTHING - {"plan.npz", "reference.npz"}
+    assert cli.main(["evaluate", "one", "--protocol", quick, "--keep", "entry"]) == 0
+    assert names(Path("entry")) == {
+        "actions.npz", "config.yaml", "policy.json", "policy.safetensors", "score.json",
+        "versions.json",
+    }  # fmt: skip
+    assert RunDirectory(Path("entry")).record().method == "monolithic"
+    assert cli.main(["evaluate", "entry"]) == 0
+    assert "compared bit for bit: equal" in capsys.readouterr().out
+    assert cli.main(["view", "entry", "--html", "entry.html"]) == 0
+    assert cli.main(["report", "entry"]) == 0
+    assert "without a plan" in Path("entry/report.html").read_text()
+
+
+def test_a_score_by_another_seed_is_no_entry(finished: Path, quick: str) -> None:
+    """Its protocol calls itself by the same name, and says that it is ranked."""
+    run = RunDirectory(finished)
+    score = run.record().score
+    for other in (replace(PROTOCOLS[quick], seed=1), replace(PROTOCOLS[quick], perturbed=9)):
+        forged = replace(score, origin=replace(score.origin, protocol=other), log=run.actions())
+        with pytest.raises(TsbenchError, match="another seed or other numbers than protocol quick"):
+            record.keep(run, Path("board"), forged)
+    assert not Path("board").exists()
+    right = replace(score.origin, protocol=PROTOCOLS[quick])
+    record.keep(run, Path("board"), replace(score, origin=right, log=run.actions()))
+    assert RunDirectory(Path("board")).record().score == replace(score, origin=right)
 
 
 def other_score(run: Path, *path: str, value: Any) -> None:
@@ -262,6 +307,12 @@ def other_score(run: Path, *path: str, value: Any) -> None:
         inner = inner[name]
     inner[path[-1]] = value
     (run / "score.json").write_text(json.dumps(content))
+
+
+def other_config(run: Path, before: str, after: str) -> None:
+    text = (run / "config.yaml").read_text()
+    assert before in text
+    (run / "config.yaml").write_text(text.replace(before, after))
 
 
 def plan_of_another_task(run: Path) -> None:
@@ -276,6 +327,10 @@ def plan_of_another_task(run: Path) -> None:
         (plan_of_another_task, "rocket_obstacles"),
         (lambda run: other_score(run, "task", value="laikago_trot"), "not of one task"),
         (lambda run: other_score(run, "method", value="mine"), "not of one method"),
+        (lambda run: other_config(run, "name: twostage", "name: monolithic"), "not of one method"),
+        (lambda run: other_score(run, "task_version", value=7), "not of one version of the task"),
+        (lambda run: other_config(run, "seed: 3", "seed: 4"), "not of one seed"),
+        (lambda run: other_score(run, "budget", value="fast"), "not of one budget"),
         (
             lambda run: other_score(run, "score", "origin", "policy", value="0" * 64),
             "one mixes several runs: its files are not of one policy",
@@ -365,7 +420,8 @@ def test_a_run_in_json(
     assert "there.json exists and nothing is overwritten" in capsys.readouterr().err
     assert not Path("r").exists()
     assert cli.main([*words, "--json=r.json", *tiny]) == 0
-    shown = plain(record.shown(record.read_score(Path("r"))))
+    assert names(Path("r")) == EVERYTHING
+    shown = plain(record.shown(RunDirectory(Path("r")).record()))
     assert json.loads(Path("r.json").read_text()) == shown
 
 
@@ -433,7 +489,11 @@ def test_a_full_disk_stops_a_run_in_one_line(size: int, tmp_path: Path) -> None:
     assert "mine" in done.stderr
     assert "File too large" in done.stderr
     assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "mine" / "score.json").exists()
+    run = RunDirectory(tmp_path / "mine")
+    assert run.finished == (size == 300_000)  # then only the pages are too large
+    if run.finished:
+        assert done.stderr.endswith("its pages are not: tsbench report mine\n")
+        assert not run.report_file.exists()
 
 
 def test_a_run_that_cannot_begin_leaves_nothing(
@@ -454,22 +514,11 @@ def test_a_run_that_fails_later_keeps_what_it_has(
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tsbench.curves.draw", fail)
+    monkeypatch.setattr(ActionLog, "save", fail)
     with pytest.raises(TsbenchError, match=r"mine: No space left on device"):
         execute(tmp_path / "mine")
     assert (tmp_path / "mine" / "policy.safetensors").exists()
     assert not (tmp_path / "mine" / "score.json").exists()
-
-
-def test_changed_constants_are_recorded(tmp_path: Path) -> None:
-    words = [*WORDS, "task.constants.distance=20.0", "method=monolithic"]
-    execute(tmp_path / "near", words)
-    content = record.read_score(tmp_path / "near")
-    assert content.standard is False
-    assert [stage.name for stage in content.stages] == ["train"]
-    policy, task = record.read_policy(tmp_path / "near")
-    assert task == tasks.make("rocket_navigation", distance=20.0)
-    assert policy.info.method == "monolithic"
 
 
 # So near that an episode takes a second and a half.
@@ -481,12 +530,63 @@ SHORT = [
 ]
 
 
+PAGES = {"learning_curves.png", "view.html", "report.html"}
+
+
+@pytest.mark.parametrize("words", [["report", "one"], ["run", "resume=one"]])
+def test_pages_that_a_finished_run_lacks_are_made(
+    words: list[str], finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From its directory alone; what is there stays."""
+    before = {name: (finished / name).read_bytes() for name in PAGES}
+    for name in PAGES - {"view.html"}:
+        (finished / name).unlink()
+    (finished / "view.html").write_text("mine")
+    assert cli.main(words) == 0
+    assert names(finished) == EVERYTHING
+    after = {name: (finished / name).read_bytes() for name in PAGES}
+    assert after == before | {"view.html": b"mine"}
+    capsys.readouterr()
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_run_whose_pages_fail_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def interrupt(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as broken:
+        broken.setattr("tsbench.launch.write_pages", interrupt)
+        assert cli.main(["run", *SHORT, "directory=one"]) == 143
+    line = "tsbench: interrupted; the run is finished, its pages are not: tsbench report one\n"
+    assert capsys.readouterr().err == line
+    assert names(Path("one")) == EVERYTHING - PAGES
+    assert cli.main(["evaluate", "one"]) == 0
+    assert cli.main(["report", "one"]) == 0
+    assert names(Path("one")) == EVERYTHING
+
+
+def test_changed_constants_are_recorded(tmp_path: Path) -> None:
+    words = [*WORDS, "task.constants.distance=20.0", "method=monolithic"]
+    execute(tmp_path / "near", words)
+    content = RunDirectory(tmp_path / "near").record()
+    assert content.standard is False
+    assert [stage.name for stage in content.stages] == ["train"]
+    policy = RunDirectory(tmp_path / "near").policy()
+    task = RunDirectory(tmp_path / "near").task(policy.info.task)
+    assert task == tasks.make("rocket_navigation", distance=20.0)
+    assert policy.info.method == "monolithic"
+
+
 def test_a_sweep_goes_on_after_failures_and_lists_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One directory is taken, one run meets a bug; when it is mended, only that is done."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["tsbench"])
     words = ["run", "-m", *SHORT, "seed=0,1,2"]
     places = [
         launch.directory(config.compose([*SHORT, f"seed={seed}"]), SHORT) for seed in (0, 1, 2)
@@ -494,12 +594,15 @@ def test_a_sweep_goes_on_after_failures_and_lists_them(
     places[0].mkdir(parents=True)
     (places[0] / "notes.txt").write_text("precious")
 
-    def fail(metrics: Path, *_: object) -> None:
-        if metrics.parent == places[1]:
+    save = ActionLog.save
+
+    def fail(self: ActionLog, path: Path) -> None:
+        if path.parent == places[1]:
             raise ZeroDivisionError("a bug")
+        save(self, path)
 
     with monkeypatch.context() as broken:
-        broken.setattr("tsbench.curves.draw", fail)
+        broken.setattr(ActionLog, "save", fail)
         assert cli.main(words) == 2
     first, second, last = capsys.readouterr().err.splitlines()
     assert first.startswith("tsbench: failed: task=rocket_navigation")
@@ -508,22 +611,23 @@ def test_a_sweep_goes_on_after_failures_and_lists_them(
     assert second.endswith(f"(log: {places[1] / 'log.txt'})")
     assert "ZeroDivisionError: a bug" in (places[1] / "log.txt").read_text()
     assert last == "tsbench: 2 of the sweep's runs failed (see above)"
-    assert record.read_score(places[2]).seed == 2
+    assert RunDirectory(places[2]).record().seed == 2
 
     (places[0] / "notes.txt").unlink()
+    (places[2] / "view.html").unlink()
     before = (places[2] / "score.json").stat().st_mtime_ns
     assert cli.main(words) == 0
     out = capsys.readouterr().out
     assert f"finished already: {places[2]}" in out
     assert "resumed: imitate goes on at " in (places[1] / "log.txt").read_text()
     assert (places[2] / "score.json").stat().st_mtime_ns == before
-    assert [record.read_score(place).seed for place in places] == [0, 1, 2]
+    assert [RunDirectory(place).record().seed for place in places] == [0, 1, 2]
+    assert [names(place) for place in places] == 3 * [EVERYTHING]
 
 
 def test_a_sweep_does_not_take_another_run_for_its_own(
-    finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["tsbench"])
     before = (finished / "score.json").read_bytes()
     assert cli.main(["run", "-m", *WORDS[:3], "seed=4", "directory=one"]) == 2
     assert "one holds a run with another configuration" in capsys.readouterr().err

@@ -257,15 +257,15 @@ def _evaluate(words: Sequence[str]) -> int:
 
     path = Path(options.policy)
     policy, task = _policy(path, options.task, options.trust_sb3)
-    finished = path.is_dir() and (path / record.SCORE).exists()
-    kept = record.read_score(path) if finished else None
+    run = record.RunDirectory(path)
+    kept = run.record() if run.finished else None
     name = options.protocol or (kept.score.protocol if kept else V1.name)
     if name not in PROTOCOLS:
         raise unknown("protocol", name, PROTOCOLS)
     protocol = PROTOCOLS[name]
-    log = record.read_actions(path) if kept else None
+    log = run.actions() if kept else None
     if options.keep is not None:
-        record.check_keep(path, options.keep, protocol)
+        record.check_keep(run, options.keep, protocol)
     console, standard = Console(), tasks.standard(task)
     with tables.progress(console, "evaluate") as progress:
         score = evaluate(
@@ -279,7 +279,7 @@ def _evaluate(words: Sequence[str]) -> int:
         comparison = compare(kept.score, score, task, log)
         agrees = comparison.agrees
         shown = record.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
-        line = f" {path / record.SCORE}: {comparison.words}"
+        line = f" {run.score_file}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     write_json(options.json, shown)
     if agrees is False:
@@ -287,7 +287,7 @@ def _evaluate(words: Sequence[str]) -> int:
             console.print(" not kept: the score is not what it was", highlight=False)
         return 1
     if options.keep is not None:
-        record.keep(path, options.keep, score)
+        record.keep(run, options.keep, score)
         console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
     return 0
 
@@ -298,8 +298,9 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
     Raises:
         TsbenchError: there is no such policy, or the word for the task is missing or wrong.
     """
-    from tsbench import adapters, record, tasks
+    from tsbench import adapters, tasks
     from tsbench.evaluation import references
+    from tsbench.record import RunDirectory
 
     name = None
     if word is not None:
@@ -311,7 +312,9 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
     if trust_sb3 is not None and path.suffix != ".zip":
         raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
     if path.is_dir():
-        policy, task = record.read_policy(path)
+        run = RunDirectory(path)
+        policy = run.policy()
+        task = run.task(policy.info.task)
         if name not in (None, task.name):
             raise TsbenchError(f"{path} holds a policy for {task.name}, not for {name}")
         return policy, task
@@ -353,6 +356,7 @@ def _view(words: Sequence[str]) -> None:
     options = parser.parse_args(words)
     if (options.what is None) == (options.compare is None):
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
+    from tsbench.files import write_new
     from tsbench.viewer import film, page, serve
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
@@ -362,7 +366,7 @@ def _view(words: Sequence[str]) -> None:
 
     shown = show(options.push)
     if options.html:
-        page.write(options.html, page.render(shown))
+        write_new(options.html, page.render(shown).encode())
     if options.video:
         film.write_video(shown, options.video)
     if options.strip:
@@ -387,16 +391,21 @@ def _port(word: str) -> int:
 def _report(words: Sequence[str]) -> None:
     parser = _parser("report", json=False)
     parser.add_argument("run", type=Path, metavar="RUN", help="a finished run's directory")
-    what = "the page to write, a new one (RUN/report.html)"
+    what = "the page to write, a new one (what RUN lacks of its report.html and view.html)"
     parser.add_argument("--html", type=Path, metavar="FILE", help=what)
     options = parser.parse_args(words)
-    from tsbench import record
-    from tsbench.viewer import page, report
+    from tsbench.files import check_new, write_new
+    from tsbench.record import RunDirectory
+    from tsbench.viewer import report
 
-    path = options.html or options.run / record.REPORT
-    if path.exists():
-        raise TsbenchError(f"{path} exists and nothing is overwritten: give another by --html FILE")
-    page.write(path, report.render(options.run))
+    run = RunDirectory(options.run)
+    report.check_finished(run)
+    path = options.html or run.report_file
+    check_new(path, "give another by --html FILE")
+    if options.html:
+        write_new(path, report.render(run).encode())
+    else:
+        report.write_pages(run)
     sys.stdout.write(f"{path}\n")
 
 

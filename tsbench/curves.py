@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 from tsbench.errors import TsbenchError
+from tsbench.files import write_new
 
 MEASURE = "episode_return"
 
@@ -47,7 +49,12 @@ def draw(metrics: Path, picture: Path) -> None:
 
     Args:
         metrics: a run's `metrics.jsonl`.
-        picture: the PNG to write.
+        picture: the PNG to write, a new file.
+
+    Raises:
+        TsbenchError: the metrics are damaged, or the picture exists or cannot be written.
     """
     if drawn := figure(metrics):
-        drawn.savefig(picture, dpi=120)
+        content = io.BytesIO()
+        drawn.savefig(content, dpi=120)
+        write_new(picture, content.getvalue())

@@ -52,21 +52,34 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def check_new(path: Path) -> None:
+def taken(place: Path, holds: str = "", way_out: str = "") -> TsbenchError:
+    """The error for a place that is taken: nothing is ever overwritten.
+
+    Args:
+        place: a file or directory.
+        holds: what is in it, for a directory that exists and may hold nothing else.
+        way_out: what the user can do instead.
     """
+    state = f"holds {holds}" if holds else "exists"
+    rest = f": {way_out}" if way_out else ""
+    return TsbenchError(f"{place} {state} and nothing is overwritten{rest}")
+
+
+def check_new(path: Path, way_out: str = "", *, parents: bool = False) -> None:
+    """
+    Args:
+        path: a file or directory to be made.
+        way_out: what the user can do where it exists.
+        parents: whether the folders above it will be made too.
+
     Raises:
-        TsbenchError: `write_json` could not write there, whatever the content.
+        TsbenchError: the path exists or cannot be made.
     """
     if path.exists():
-        raise TsbenchError(f"{path} exists and nothing is overwritten")
-    check_writable(path, path.parent)
-
-
-def check_writable(path: Path, folder: Path) -> None:
-    """
-    Raises:
-        TsbenchError: `path` cannot be made, since nothing can be in `folder`.
-    """
+        raise taken(path, way_out=way_out)
+    folder = path.absolute().parent
+    while parents and not folder.exists():
+        folder = folder.parent
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -74,17 +87,25 @@ def check_writable(path: Path, folder: Path) -> None:
         raise TsbenchError(f"{path}: {error.strerror}") from None
 
 
-def write_json(path: Path | None, content: Any) -> None:
-    """Writes a JSON file, if one is asked for; nothing is overwritten.
+def write_new(path: Path, content: bytes) -> None:
+    """Writes a file where there is none.
 
     Raises:
         TsbenchError: the file exists or cannot be written.
     """
-    if path is None:
-        return
     check_new(path)
     with os_errors(path):
-        write_whole(path, (_legible(json.dumps(content, indent=2)) + "\n").encode())
+        write_whole(path, content)
+
+
+def write_json(path: Path | None, content: Any) -> None:
+    """Writes a new JSON file, if one is asked for.
+
+    Raises:
+        TsbenchError: the file exists or cannot be written.
+    """
+    if path is not None:
+        write_new(path, (_legible(json.dumps(content, indent=2)) + "\n").encode())
 
 
 def _legible(text: str) -> str:

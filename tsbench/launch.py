@@ -17,12 +17,14 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from rich.console import Console
 
-from tsbench import config, run
+from tsbench import config, run, tables
 from tsbench.config import RunConfig
-from tsbench.errors import TsbenchError
+from tsbench.errors import Stopped, TsbenchError, memory_errors
 from tsbench.files import write_json
-from tsbench.record import LOG, read_score, shown
+from tsbench.record import RunDirectory, shown
+from tsbench.viewer.report import write_pages
 
 RUNS = Path("runs")
 LONGEST_NAME = 200  # characters; file systems allow 255 bytes
@@ -49,9 +51,8 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
     if any(word.startswith(RESUME) for word in words):
         if len(words) > 1:
             raise TsbenchError("resume=RUN goes on with the run's own configuration: give it alone")
-        resumed = Path(words[0].removeprefix(RESUME))
-        run.resume(resumed)
-        write_json(json, shown(read_score(resumed)))
+        resumed = _resume(Path(words[0].removeprefix(RESUME)))
+        write_json(json, shown(RunDirectory(resumed).record()))
         return
     if json is not None and flags.multirun:
         raise TsbenchError("--json is for one run; each of a sweep's has its score.json")
@@ -81,18 +82,22 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
         given = list(HydraConfig.get().overrides.task)
         chosen = config.parse(node)
         chosen = replace(chosen, directory=chosen.directory or str(directory(chosen, given)))
+        place = RunDirectory(Path(chosen.directory or ""))
         try:
             if flags.multirun:
-                return run.complete(chosen, given)
+                reward = run.complete(chosen, given)
+                finish(place.path)
+                return reward
             reward = run.execute(chosen, given).normalized_reward
-            write_json(json, shown(read_score(Path(chosen.directory or ""))))
+            finish(place.path)
+            write_json(json, shown(place.record()))
             return reward
         except Exception as error:
             known = isinstance(error, TsbenchError)
             # A launcher's worker has to let the failure travel back.
             if os.getpid() != parent or not (known or flags.multirun):
                 raise
-            log = Path(chosen.directory or "") / LOG
+            log = place.log_file
             if not known and log.exists():
                 with log.open("a", encoding="utf-8") as file:
                     traceback.print_exc(file=file)
@@ -112,6 +117,38 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
         sys.stderr.write(f"tsbench: failed: {name}: {reason}{where}\n")
     if failures:
         raise TsbenchError(f"{len(failures)} of the sweep's runs failed (see above)")
+
+
+def finish(directory: Path, console: Console | None = None) -> None:
+    """Makes the pages that a finished run lacks, and tells where they are.
+
+    Raises:
+        TsbenchError: a page cannot be made. The run is finished all the same.
+        Stopped: by Ctrl-C or SIGTERM.
+    """
+    finished = RunDirectory(directory)
+    way_on = f"; the run is finished, its pages are not: tsbench report {directory}"
+    try:
+        with run.signals(_stop), memory_errors():
+            write_pages(finished)
+    except TsbenchError as error:
+        raise TsbenchError(f"{error}{way_on}") from error
+    except Stopped as stopped:
+        raise Stopped(stopped.signal, f"{stopped}{way_on}") from None
+    tables.show_places(console or Console(), finished)
+
+
+def _stop(number: int) -> NoReturn:
+    raise Stopped(number)
+
+
+def _resume(place: Path) -> Path:
+    """Goes on with a run: with its training, or with the pages of a finished one."""
+    found = RunDirectory(place)
+    if not found.finished or found.report_file.exists():
+        run.resume(place)
+    finish(place)
+    return place
 
 
 def directory(chosen: RunConfig, words: Sequence[str]) -> Path:

@@ -23,33 +23,17 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from tsbench import curves, methods, tables, tasks
+from tsbench import methods, tables, tasks
 from tsbench.config import RunConfig
 from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
-from tsbench.files import PART, write_json, write_whole
+from tsbench.files import PART, taken, write_json, write_whole
 from tsbench.problem import Problem
-from tsbench.record import (
-    ACTIONS,
-    CHECKPOINTS,
-    CONFIG,
-    CURVES,
-    DUMP,
-    METRICS,
-    PAGE,
-    REPORT,
-    SCORE,
-    VERSIONS,
-    Record,
-    read_config,
-    read_score,
-    read_versions,
-)
+from tsbench.record import Record, RunDirectory
 from tsbench.rl.stages import KINDS, settings
 from tsbench.sim.model import compiled_hash
-from tsbench.viewer.report import write_run_pages
 from tsbench.workspace import RunWorkspace
 
 # What can change a number in a run.
@@ -95,7 +79,7 @@ def prepare(config: RunConfig) -> Problem:
 
 
 def execute(config: RunConfig, words: Sequence[str] = (), console: Console | None = None) -> Score:
-    """Trains, evaluates, and leaves it all in `config.directory`.
+    """Trains, evaluates, and leaves it all in `config.directory`, but for the pages about it.
 
     Args:
         config: what to run, with its directory.
@@ -108,18 +92,18 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
         Stopped: by Ctrl-C or SIGTERM.
     """
     problem = prepare(config)
-    directory = Path(config.directory or "")
-    with os_errors(directory):
-        found = set(directory.iterdir()) if directory.is_dir() else None
-        _create(directory)
-    with _locked(directory), _explained(directory):
+    run = RunDirectory(Path(config.directory or ""))
+    with os_errors(run.path):
+        found = set(run.path.iterdir()) if run.path.is_dir() else None
+        _create(run)
+    with _locked(run.path), _explained(run):
         try:
-            _write_provenance(directory, config, problem, words)
-            line = f"{' '.join(['tsbench run', *words])} -> {directory}"
-            return _work(config, problem, directory, line, console or Console())
+            _write_provenance(run, config, problem, words)
+            line = f"{' '.join(['tsbench run', *words])} -> {run.path}"
+            return _work(config, problem, run, line, console or Console())
         except (TsbenchError, OSError) as error:
-            if not _trained(directory) and not isinstance(error, NotFiniteError):
-                _leave_as_found(directory, found)
+            if not run.trained and not isinstance(error, NotFiniteError):
+                _leave_as_found(run.path, found)
             raise
 
 
@@ -131,19 +115,20 @@ def resume(directory: Path, console: Console | None = None) -> Score:
             another configuration or other versions. Beyond that, as `execute`.
         Stopped: by Ctrl-C or SIGTERM.
     """
-    if not (directory / CONFIG).is_file():
+    run = RunDirectory(directory)
+    if not run.begun:
         raise TsbenchError(f"there is no run in {directory}")
     with _locked(directory):
-        if (directory / SCORE).exists():
+        if run.finished:
             raise TsbenchError(f"{directory} holds a finished run: there is nothing to resume")
-        config = replace(read_config(directory), directory=str(directory))
+        config = replace(run.config(), directory=str(directory))
         problem = prepare(config)
-        _check_provenance(directory, config, problem)
-        with _explained(directory):
-            for path in (directory / PAGE, directory / REPORT, *directory.rglob(f"*{PART}")):
+        _check_provenance(run, config, problem)
+        with _explained(run):
+            for path in directory.rglob(f"*{PART}"):
                 path.unlink(missing_ok=True)
             line = f"tsbench run resume={directory}"
-            return _work(config, problem, directory, line, console or Console())
+            return _work(config, problem, run, line, console or Console())
 
 
 def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
@@ -156,31 +141,34 @@ def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
         TsbenchError: as `execute` and `resume`; or the directory holds another run.
         Stopped: by Ctrl-C or SIGTERM.
     """
-    directory = Path(config.directory or "")
-    if not (directory / CONFIG).is_file():
+    run = RunDirectory(Path(config.directory or ""))
+    if not run.begun:
         return execute(config, words).normalized_reward
-    if read_config(directory).identity != config.identity:
-        raise TsbenchError(
-            f"{directory} holds a run with another configuration and nothing is overwritten"
-        )
-    if (directory / SCORE).exists():
-        Console().print(f"finished already: {directory}", highlight=False, soft_wrap=True)
-        return read_score(directory).score.normalized_reward
-    return resume(directory).normalized_reward
+    if run.config().identity != config.identity:
+        raise taken(run.path, "a run with another configuration")
+    if run.finished:
+        Console().print(f"finished already: {run.path}", highlight=False, soft_wrap=True)
+        return run.record().score.normalized_reward
+    return resume(run.path).normalized_reward
 
 
 def _work(
-    config: RunConfig, problem: Problem, directory: Path, line: str, console: Console
+    config: RunConfig, problem: Problem, run: RunDirectory, line: str, console: Console
 ) -> Score:
-    run = json.dumps(_identity(config, problem), sort_keys=True)
+    identity = json.dumps(_identity(config, problem), sort_keys=True)
     workspace = RunWorkspace(
-        directory, console, interval=config.checkpoint, run=hashlib.sha256(run.encode()).hexdigest()
+        run.path,
+        console,
+        interval=config.checkpoint,
+        run=hashlib.sha256(identity.encode()).hexdigest(),
     )
-    with closing(workspace), _signals(workspace.stop), memory_errors():
+    with closing(workspace), signals(workspace.stop), memory_errors():
         workspace.note(line)
-        score = _train(config, problem, workspace, console)
-    shutil.rmtree(directory / CHECKPOINTS, ignore_errors=True)
-    return score
+        record = _train(config, problem, workspace, console)
+        write_json(run.score_file, record.as_dict())  # last: it says that the run is finished
+    tables.show_run(console, record)
+    shutil.rmtree(run.checkpoints, ignore_errors=True)
+    return record.score
 
 
 @contextmanager
@@ -199,8 +187,8 @@ def _locked(directory: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _signals(stop: Callable[[int], None]) -> Iterator[None]:
-    """Lets Ctrl-C and SIGTERM call `stop`, where that is this thread's business."""
+def signals(stop: Callable[[int], None]) -> Iterator[None]:
+    """Lets Ctrl-C and SIGTERM call `stop` with their number, where this thread may do that."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -216,50 +204,46 @@ def _signals(stop: Callable[[int], None]) -> Iterator[None]:
 
 
 @contextmanager
-def _explained(directory: Path) -> Iterator[None]:
+def _explained(run: RunDirectory) -> Iterator[None]:
     """Turns what stops a run into one line, which says how to go on where one can."""
     try:
-        with os_errors(directory):
+        with os_errors(run.path):
             yield
     except NotFiniteError as error:
-        raise TsbenchError(f"{error}{_dumped(directory, error)}") from error
+        raise TsbenchError(f"{error}{_dumped(run.dump_file, error)}") from error
     except TsbenchError as error:
-        raise TsbenchError(f"{error}{_way_on(directory)}") from error
+        raise TsbenchError(f"{error}{_way_on(run)}") from error
     except Stopped as stopped:
-        raise Stopped(stopped.signal, f"{stopped}{_way_on(directory)}") from None
+        raise Stopped(stopped.signal, f"{stopped}{_way_on(run)}") from None
 
 
-def _dumped(directory: Path, error: NotFiniteError) -> str:
+def _dumped(path: Path, error: NotFiniteError) -> str:
     """Keeps what the wrong number was computed from."""
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **error.arrays)
-    with os_errors(directory / DUMP):
-        write_whole(directory / DUMP, content.getvalue())
-    return f"; what it came from is in {directory / DUMP}"
+    with os_errors(path):
+        write_whole(path, content.getvalue())
+    return f"; what it came from is in {path}"
 
 
-def _way_on(directory: Path) -> str:
-    return f"; to go on: tsbench run resume={directory}" if _trained(directory) else ""
+def _way_on(run: RunDirectory) -> str:
+    return f"; to go on: tsbench run resume={run.path}" if run.trained else ""
 
 
-def _trained(directory: Path) -> bool:
-    """Whether a run has anything that would be lost with its directory."""
-    metrics = directory / METRICS
-    return metrics.exists() and metrics.stat().st_size > 0
-
-
-def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console: Console) -> Score:
-    directory = workspace.directory
+def _train(
+    config: RunConfig, problem: Problem, workspace: RunWorkspace, console: Console
+) -> Record:
+    run = RunDirectory(workspace.directory)
     policy = methods.find(config.method["name"]).train(problem, workspace)
-    policy.save(directory)
+    policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
     with tables.progress(console, "evaluate") as progress:
         score = evaluate(
             policy, problem.task, protocol=protocol, threads=problem.threads, progress=progress
         )
     assert score.log is not None
-    score.log.save(directory / ACTIONS)
-    record = Record(
+    score.log.save(run.actions_file)
+    return Record(
         task=problem.task.name,
         task_version=problem.task.version,
         standard=tasks.standard(problem.task),
@@ -269,28 +253,21 @@ def _train(config: RunConfig, problem: Problem, workspace: RunWorkspace, console
         score=score,
         stages=tuple(replace(stage, seconds=round(stage.seconds, 3)) for stage in workspace.stages),
     )
-    curves.draw(directory / METRICS, directory / CURVES)
-    write_run_pages(directory, record)
-    write_json(directory / SCORE, record.as_dict())  # last: it says that the run is finished
-    tables.show_run(console, record, directory)
-    return score
 
 
-def _create(directory: Path) -> None:
+def _create(run: RunDirectory) -> None:
     """Makes the directory. One that is empty, or that a run left before it began, will do."""
-    directory.mkdir(parents=True, exist_ok=True)
-    left = {path.name.removesuffix(PART) for path in directory.iterdir()}
-    if left <= {VERSIONS, CONFIG} and not (directory / CONFIG).exists():
+    run.path.mkdir(parents=True, exist_ok=True)
+    left = {path.name.removesuffix(PART) for path in run.path.iterdir()}
+    if left <= {run.versions_file.name, run.config_file.name} and not run.config_file.exists():
         return
-    if (directory / SCORE).exists():
-        state, way = "a finished run", ""
-    elif (directory / CONFIG).exists():
-        state, way = "an unfinished run", f"go on with resume={directory}, or "
-    else:
-        state, way = "other files", ""
-    raise TsbenchError(
-        f"{directory} holds {state} and nothing is overwritten: {way}choose another directory=PATH"
-    )
+    elsewhere = "choose another directory=PATH"
+    if run.finished:
+        raise taken(run.path, "a finished run", elsewhere)
+    if run.config_file.exists():
+        way_out = f"go on with resume={run.path}, or {elsewhere}"
+        raise taken(run.path, "an unfinished run", way_out)
+    raise taken(run.path, "other files", elsewhere)
 
 
 def _leave_as_found(directory: Path, found: set[Path] | None) -> None:
@@ -306,7 +283,7 @@ def _leave_as_found(directory: Path, found: set[Path] | None) -> None:
 
 
 def _write_provenance(
-    directory: Path, config: RunConfig, problem: Problem, words: Sequence[str]
+    run: RunDirectory, config: RunConfig, problem: Problem, words: Sequence[str]
 ) -> None:
     """Writes what is needed to repeat the run: versions.json, and config.yaml, which comes last:
     its presence says that the run has begun."""
@@ -315,11 +292,11 @@ def _write_provenance(
         "platform": platform.platform(),
         "commit": _commit(),
     }
-    (directory / VERSIONS).unlink(missing_ok=True)
-    write_json(directory / VERSIONS, versions)
+    run.versions_file.unlink(missing_ok=True)
+    write_json(run.versions_file, versions)
     command = " ".join(["tsbench run", *words])
     content = yaml.safe_dump(asdict(config), sort_keys=False)
-    write_whole(directory / CONFIG, f"# {command}\n{content}".encode())
+    write_whole(run.config_file, f"# {command}\n{content}".encode())
 
 
 def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
@@ -337,17 +314,16 @@ def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     }
 
 
-def _check_provenance(directory: Path, config: RunConfig, problem: Problem) -> None:
+def _check_provenance(run: RunDirectory, config: RunConfig, problem: Problem) -> None:
     """
     Raises:
         TsbenchError: a run begun as `versions.json` says would not go on to the same bits now.
     """
-    path = directory / VERSIONS
-    before = read_versions(directory)
+    before = run.versions()
     for name, now in _identity(config, problem).items():
         if before.get(name) != now:
             raise TsbenchError(
-                f"{directory} was begun with another {_NAMES[name]} (see {path}), "
+                f"{run.path} was begun with another {_NAMES[name]} (see {run.versions_file}), "
                 "so an exact resume is impossible: begin it again elsewhere"
             )
 

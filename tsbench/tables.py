@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -15,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
 from tsbench.evaluation.score import Score, Summary
-from tsbench.record import REPORT, Record
+from tsbench.record import Record, RunDirectory
 
 
 def duration(seconds: float) -> str:
@@ -76,14 +75,8 @@ def score_table(title: str, score: Score) -> Table:
     return table
 
 
-def show_run(console: Console, record: Record, directory: Path) -> None:
-    """Prints what ends a run: its score, what each stage cost, and where to look next.
-
-    Args:
-        console: to print on.
-        record: the content of `score.json`.
-        directory: of the run.
-    """
+def show_run(console: Console, record: Record) -> None:
+    """Prints what ends a run: its score and what each stage cost."""
     table = score_table(run_title(record), record.score)
     table.add_section()
     table.add_row("stage", "steps", "time", style="bold")
@@ -91,9 +84,13 @@ def show_run(console: Console, record: Record, directory: Path) -> None:
         table.add_row(stage.name, f"{stage.steps:,}", duration(stage.seconds))
     console.print(table)
     show_rank(console, record.standard, record.score)
+
+
+def show_places(console: Console, run: RunDirectory) -> None:
+    """Prints where to look at a finished run next."""
     for what, where in (
-        ("what came out", directory / REPORT),
-        ("score it again", f"tsbench evaluate {directory}"),
+        ("what came out", run.report_file),
+        ("score it again", f"tsbench evaluate {run.path}"),
     ):
         console.print(f" {what:<17} {where}", markup=False, highlight=False, soft_wrap=True)
 

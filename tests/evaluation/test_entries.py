@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsbench import record, tasks
+from tsbench import tasks
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.evaluation.replay import compare, replay
-from tsbench.motion import Plan, ReferenceMotion
+from tsbench.record import RunDirectory
 
 BOARDS = Path(__file__).parents[2] / "leaderboards"
 ENTRIES = sorted(path.parent for path in BOARDS.glob("v1/*/*/*/policy.json"))
@@ -25,11 +25,14 @@ def test_entries_are_of_tasks() -> None:
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
 def test_an_entry_holds_together(entry: Path) -> None:
-    assert {path.name for path in entry.iterdir()} == {*record.KEPT, record.ACTIONS}
-    policy, task = record.read_policy(entry)
+    run = RunDirectory(entry)
+    needed = {*run.essential, run.actions_file}
+    assert needed <= set(entry.iterdir()) <= {*needed, *run.optional}
+    policy = run.policy()
+    task = run.task(policy.info.task)
     check_fit(policy, task)
     assert tasks.standard(task)
-    content = record.read_score(entry)
+    content = run.record()
     assert (content.task, content.method) == entry.parts[-3:-1] == (
         policy.info.task, policy.info.method,
     )  # fmt: skip
@@ -38,9 +41,9 @@ def test_an_entry_holds_together(entry: Path) -> None:
     assert score.origin.protocol == PROTOCOLS[entry.parts[-4]]
     assert score.origin.protocol.ranked
     assert score.origin.policy == policy.info.sha256
-    assert (entry / record.CONFIG).read_text().startswith("# tsbench run ")
-    assert Plan.load(entry / record.PLAN).task == task.name
-    assert ReferenceMotion.load(entry / record.REFERENCE).task == task.name
+    assert run.config_file.read_text().startswith("# tsbench run ")
+    for motion in (run.plan(task), run.reference(task)):
+        assert motion is None or motion.task == task.name
     assert score.success == 1.0
     assert score.robustness.survival_100N == 1.0  # the paper's claim
     if task.pushed == "trunk":
@@ -50,9 +53,10 @@ def test_an_entry_holds_together(entry: Path) -> None:
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
 def test_an_entry_repeats(entry: Path) -> None:
     """The physics from the action log, and the policy's own episode."""
-    policy, task = record.read_policy(entry)
-    score = record.read_score(entry).score
-    log = record.read_actions(entry)
+    policy = RunDirectory(entry).policy()
+    task = RunDirectory(entry).task(policy.info.task)
+    score = RunDirectory(entry).record().score
+    log = RunDirectory(entry).actions()
     assert log is not None
     again = evaluate(policy, task, protocol=PROTOCOLS["smoke"], threads=1)
     then, now = score.origin, again.origin
@@ -69,7 +73,7 @@ def test_an_entry_repeats(entry: Path) -> None:
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
 def test_the_surface_fits_its_summary(entry: Path) -> None:
-    robustness = record.read_score(entry).score.robustness
+    robustness = RunDirectory(entry).record().score.robustness
     surface = robustness.surface
     at_claim = np.isclose(surface.forces_N, 100.0 * robustness.mass_scale)
     assert np.array(surface.survived)[at_claim].mean() == robustness.survival_100N

@@ -73,7 +73,7 @@ def test_what_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     shown = Show(model, [Actor("executed", np.zeros((2, 3)), 0.1, PLAN_COLOUR, "")], "")
     there = tmp_path / "there.mp4"
     there.write_text("mine")
-    with pytest.raises(TsbenchError, match="exists already"):
+    with pytest.raises(TsbenchError, match=r"there\.mp4 exists and nothing is overwritten"):
         film.write_video(shown, there)
     with pytest.raises(TsbenchError, match=r"must end in \.png"):
         film.write_strip(shown, tmp_path / "x.jpg")

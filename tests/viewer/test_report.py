@@ -12,6 +12,7 @@ import pytest
 from tsbench import cli, curves
 from tsbench.errors import TsbenchError
 from tsbench.motion import Plan
+from tsbench.record import RunDirectory
 from tsbench.viewer import report
 
 MakeRun = Callable[..., Path]
@@ -24,7 +25,7 @@ def words_of(text: str) -> str:
 
 def test_a_report_says_what_was_planned_and_done_and_how_good_it_is(make_run: MakeRun) -> None:
     run = make_run("laikago_trot")
-    text = report.render(run)
+    text = report.render(RunDirectory(run))
     assert len(text) < 3e6
     own = words_of(text)
     for words in (
@@ -51,7 +52,7 @@ def test_what_a_run_lacks_is_left_out(make_run: MakeRun) -> None:
     run = make_run("rocket_navigation", 0.7)
     for name in ("plan.npz", "reference.npz", "metrics.jsonl"):
         (run / name).unlink()
-    own = words_of(report.render(run))
+    own = words_of(report.render(RunDirectory(run)))
     assert "without a plan" in own
     for words in ("Foot contacts", "Joints", "How it learned", "physics follow"):
         assert words not in own
@@ -61,9 +62,9 @@ def test_only_finished_runs_have_reports(make_run: MakeRun, tmp_path: Path) -> N
     run = make_run("rocket_navigation", 0.7)
     (run / "score.json").unlink()
     with pytest.raises(TsbenchError, match=r"has no score\.json: only a finished run"):
-        report.render(run)
+        report.render(RunDirectory(run))
     with pytest.raises(TsbenchError, match="no run directory"):
-        report.render(tmp_path / "nowhere")
+        report.render(RunDirectory(tmp_path / "nowhere"))
 
 
 def test_the_command_writes_it_beside_the_run(

@@ -34,7 +34,7 @@ from tsbench.config import compose
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS
 from tsbench.problem import Problem
-from tsbench.record import REFERENCE
+from tsbench.record import RunDirectory
 from tsbench.rl.ppo import PPOSettings
 from tsbench.rl.stages import settings
 from tsbench.run import prepare
@@ -89,7 +89,7 @@ def compare(name: str, effort: Effort) -> Findings:
     problem = prepare(compose([f"task={name}", f"budget={effort.budget}"]))
     with tempfile.TemporaryDirectory() as folder:
         ours = train(problem, Path(folder))
-        reference = ReferenceMotion.load(Path(folder) / REFERENCE)
+        reference = ReferenceMotion.load(RunDirectory(Path(folder)).reference_file)
     imitation = Imitation(problem.task, reference)
     theirs = Rival(imitation, settings(problem, "imitate"), problem.seed, ours.steps)
     outcome = theirs.learn(ours, judge(problem.task))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from tsbench.errors import TsbenchError
+from tsbench.files import check_new
 from tsbench.viewer import scene
 from tsbench.viewer.framing import Framing, framing
 from tsbench.viewer.scene import Array
@@ -304,12 +305,11 @@ def _bytes(colour: Rgb) -> tuple[int, int, int]:
 def _refuse(path: Path, ending: str) -> None:
     """
     Raises:
-        TsbenchError: the file exists, or its name says that it is something else.
+        TsbenchError: the file exists or cannot be made, or its name says that it is something else.
     """
     if path.suffix.lower() != ending:
         raise TsbenchError(f"{path} must end in {ending}")
-    if path.exists():
-        raise TsbenchError(f"{path} exists already; name another file or remove it")
+    check_new(path)
 
 
 @contextlib.contextmanager

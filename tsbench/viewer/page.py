@@ -26,7 +26,6 @@ from meshcat import Visualizer
 from numpy.typing import NDArray
 
 from tsbench.errors import TsbenchError
-from tsbench.files import write_whole
 from tsbench.viewer import scene
 from tsbench.viewer.framing import Framing, framing
 from tsbench.viewer.scene import Array
@@ -387,17 +386,3 @@ def render(show: Show, *, served: bool = False) -> str:
             "page": embedded(data),
         },
     )
-
-
-def write(path: Path, text: str) -> None:
-    """Writes a page, a new one.
-
-    Raises:
-        TsbenchError: the file exists or cannot be written.
-    """
-    if path.exists():
-        raise TsbenchError(f"{path} exists already; name another file or remove it")
-    try:
-        write_whole(path, text.encode())
-    except OSError as error:
-        raise TsbenchError(f"cannot write {path}: {error.strerror or error}") from error

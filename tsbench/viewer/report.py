@@ -1,20 +1,21 @@
 """The report of a run: one page that says what was planned, what was executed, and how good it is.
 
-It needs nothing else to be opened: the 3-D view and all charts are inside.
+It is made from the run's directory alone, and needs nothing else to be opened: the 3-D view and all
+charts are inside.
 """
 
 from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from tsbench import record, tables
+from tsbench import curves, tables
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.score import Score
-from tsbench.motion import Plan
+from tsbench.files import write_new
+from tsbench.record import RunDirectory
 from tsbench.task import plannable
 from tsbench.viewer import charts, page
 from tsbench.viewer.compose import foot_bands
@@ -25,47 +26,62 @@ from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words,
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
 
 
-def write_run_pages(directory: Path, score: record.Record) -> None:
-    """Writes a run's `view.html` and `report.html`, new files.
-
-    Args:
-        directory: of the run, with everything but its score in it.
-        score: what is to become `score.json`.
+def write_pages(run: RunDirectory) -> None:
+    """Makes those of a finished run's `learning_curves.png`, `view.html` and `report.html` that
+    are missing.
 
     Raises:
-        TsbenchError: a file exists or cannot be written.
+        TsbenchError: the run is not finished, a file in it is missing or damaged, or a page cannot
+            be written.
     """
-    view, report = _pages(run_subject(directory, score), directory)
-    page.write(directory / record.PAGE, view)
-    page.write(directory / record.REPORT, report)
+    check_finished(run)
+    if run.metrics_file.exists() and not run.curves_file.exists():
+        curves.draw(run.metrics_file, run.curves_file)
+    missing = [path for path in (run.view_file, run.report_file) if not path.exists()]
+    if missing:
+        view, report = _pages(run)
+        for path in missing:
+            write_new(path, (view if path == run.view_file else report).encode())
 
 
-def render(directory: Path) -> str:
+def render(run: RunDirectory) -> str:
     """The report of a finished run.
 
     Raises:
         TsbenchError: the run is not finished, or a file in it is missing or damaged.
     """
-    if directory.is_dir() and not (directory / record.SCORE).exists():
-        raise TsbenchError(f"{directory} has no {record.SCORE}: only a finished run has a report")
-    return _pages(run_subject(directory), directory)[1]
+    check_finished(run)
+    return _pages(run)[1]
 
 
-def _pages(run: Subject, directory: Path) -> tuple[str, str]:
+def check_finished(run: RunDirectory) -> None:
+    """
+    Raises:
+        TsbenchError: there is no finished run.
+    """
+    if not run.path.is_dir():
+        raise TsbenchError(f"no run directory {run.path}")
+    if not run.finished:
+        reason = "only a finished run has a report"
+        raise TsbenchError(f"{run.path} has no {run.score_file.name}: {reason}")
+
+
+def _pages(run: RunDirectory) -> tuple[str, str]:
     """The page with the 3-D view, and the report that has it inside."""
-    assert run.policy is not None
-    assert run.score is not None
-    plan, recording = run.plan(), record_episode(run.task, run.policy)
-    view = page.render(run.show_of(recording, plan))
+    subject = run_subject(run)
+    assert subject.policy is not None
+    assert subject.score is not None
+    plan, recording = subject.plan(), record_episode(subject.task, subject.policy)
+    view = page.render(subject.show_of(recording, plan))
     report = page.fill(
         "report.html",
         {
-            "title": html.escape(run.title),
+            "title": html.escape(subject.title),
             "plan": page.css(PLAN_COLOUR),
             "executed": page.css(EXECUTED_COLOUR),
-            "answers": "".join(_answers(run.score.score, recording, plan)),
+            "answers": "".join(_answers(subject.score.score, recording, plan)),
             "view": html.escape(view),
-            "sections": "".join(_sections(run, directory, recording, plan)),
+            "sections": "".join(_sections(subject, run, recording, plan)),
         },
     )
     return view, report
@@ -93,9 +109,9 @@ def _worth_in_words(score: Score) -> str:
 
 
 def _sections(
-    run: Subject, directory: Path, recording: Recording, plan: Recording | None
+    subject: Subject, run: RunDirectory, recording: Recording, plan: Recording | None
 ) -> Iterator[str]:
-    assert run.score is not None
+    assert subject.score is not None
     duration = max(r.duration for r in (recording, plan) if r is not None)
     if recording.task.drawing().feet:
         bands = foot_bands(plan or recording, recording)
@@ -121,9 +137,9 @@ def _sections(
     yield _section(
         "Robustness",
         "Pushes on the robot's body: which it survives without a fall.",
-        charts.robustness(run.score.score.robustness.surface, run.task.timestep),
+        charts.robustness(subject.score.score.robustness.surface, subject.task.timestep),
     )
-    metrics = directory / record.METRICS
+    metrics = run.metrics_file
     if learning := charts.learning(metrics) if metrics.exists() else None:
         yield _section(
             "How it learned",
@@ -132,9 +148,9 @@ def _sections(
         )
     yield _section(
         "Numbers",
-        f"Everything in this page comes from {directory.name}/; the same score again: tsbench "
+        f"Everything in this page comes from {run.path.name}/; the same score again: tsbench "
         "evaluate. How the run was made is in config.yaml and versions.json.",
-        f'<div class="tables">{"".join(_tables(run, directory))}</div>',
+        f'<div class="tables">{"".join(_tables(subject, run))}</div>',
     )
 
 
@@ -145,21 +161,18 @@ def _agreement(recording: Recording) -> str:
     return f"Both agree {share:.0%} of the time."
 
 
-def _tables(run: Subject, directory: Path) -> Iterator[str]:
-    assert run.score is not None
-    yield _table(_score_rows(run.score.score))
+def _tables(subject: Subject, run: RunDirectory) -> Iterator[str]:
+    assert subject.score is not None
+    yield _table(_score_rows(subject.score.score))
     costs = [
         (stage.name, f"{stage.steps:,}", f"{stage.physics_substeps:,}",
          tables.duration(stage.seconds))
-        for stage in run.score.stages
+        for stage in subject.score.stages
     ]  # fmt: skip
     yield _table([("stage", "environment steps", "physics steps", "time"), *costs])
-    path = directory / record.PLAN
-    if path.exists() and run.reference is not None:
-        plan = Plan.load(path)
-        task = plannable(run.task)
-        task.check_fit(plan)
-        audit = task.audit(plan, run.reference)
+    plan = run.plan(subject.task)
+    if plan is not None and subject.reference is not None:
+        audit = plannable(subject.task).audit(plan, subject.reference)
         items = [
             (item.what, f"{item.value:.3g} {item.unit}", f"{item.limit:.3g} {item.unit}",
              "ok" if item.passed else "too much")

@@ -9,10 +9,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from tsbench import record, tables, tasks
+from tsbench import tables, tasks
 from tsbench.errors import TsbenchError
 from tsbench.motion import Plan, ReferenceMotion, read_motion
 from tsbench.policy import Policy
+from tsbench.record import Record, RunDirectory
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.push import Push
 from tsbench.task import Task, plannable
@@ -38,7 +39,7 @@ class Subject:
     task: Task[Any]
     policy: Policy | None
     reference: ReferenceMotion | None
-    score: record.Record | None = None
+    score: Record | None = None
 
     def plan(self) -> Recording | None:
         return None if self.reference is None else record_motion(self.task, self.reference)
@@ -84,7 +85,9 @@ def subject(word: str) -> Subject:
     if word.startswith("task="):
         return task_subject(tasks.make(word.removeprefix("task=")))
     path = Path(word)
-    return run_subject(path) if path.is_dir() or not path.exists() else plan_subject(path)
+    if path.is_dir() or not path.exists():
+        return run_subject(RunDirectory(path))
+    return plan_subject(path)
 
 
 def task_subject(task: Task[Any]) -> Subject:
@@ -94,28 +97,20 @@ def task_subject(task: Task[Any]) -> Subject:
     return Subject(title, task, None, planned.reference(naive_plan(planned)))
 
 
-def run_subject(directory: Path, score: record.Record | None = None) -> Subject:
-    """A run.
-
-    Args:
-        directory: of the run; nothing but the policy must be in it.
-        score: what its `score.json` is to say, None for what it says.
+def run_subject(run: RunDirectory) -> Subject:
+    """A run, of which nothing but the policy must be there.
 
     Raises:
         TsbenchError: there is no such directory, or a file in it is missing or damaged.
     """
-    policy, task = record.read_policy(directory)
-    if score is None and (directory / record.SCORE).exists():
-        score = record.read_score(directory)
-    path = directory / record.REFERENCE
-    reference = ReferenceMotion.load(path) if path.exists() else None
-    if reference is not None:
-        plannable(task).check_fit(reference)
+    policy = run.policy()
+    task = run.task(policy.info.task)
+    score = run.record() if run.finished else None
     return Subject(
         title=tables.run_title(score) if score else task.name,
         task=task,
         policy=policy,
-        reference=reference,
+        reference=run.reference(task),
         score=score,
     )
 
@@ -127,10 +122,7 @@ def plan_subject(path: Path) -> Subject:
         TsbenchError: the file is neither, damaged, or for another version of its task.
     """
     motion = read_motion(path)
-    constants = {}
-    if (path.parent / record.CONFIG).exists():
-        constants = record.read_config(path.parent).task.constants
-    task = plannable(tasks.make(motion.task, **constants))
+    task = plannable(RunDirectory(path.parent).task(motion.task))
     task.check_fit(motion)
     if isinstance(motion, Plan):
         motion = task.reference(motion)
@@ -144,7 +136,7 @@ def pair(runs: Sequence[str], push: str | None = None) -> Show:
         TsbenchError: they are for different tasks, one of them is damaged, or the push comes after
             the end of both.
     """
-    subjects = [run_subject(Path(word)) for word in runs]
+    subjects = [run_subject(RunDirectory(Path(word))) for word in runs]
     force = None if push is None else parse_push(push, subjects[0].task)
     recordings = [record_episode(s.task, cast(Policy, s.policy), force) for s in subjects]
     check_pushed(force, recordings)
