@@ -21,8 +21,6 @@ TASK = "task=rocket_navigation"
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every command runs in an empty directory, so that what it writes can be seen."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["tsbench"])
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:

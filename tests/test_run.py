@@ -419,7 +419,9 @@ def test_a_run_in_json(
     assert cli.main([*words, "--json", "there.json", *tiny]) == 2
     assert "there.json exists and nothing is overwritten" in capsys.readouterr().err
     assert not Path("r").exists()
+    arguments = list(sys.argv)
     assert cli.main([*words, "--json=r.json", *tiny]) == 0
+    assert sys.argv == arguments
     assert names(Path("r")) == EVERYTHING
     shown = plain(record.shown(RunDirectory(Path("r")).record()))
     assert json.loads(Path("r.json").read_text()) == shown

@@ -1,20 +1,27 @@
-"""From the words of `tsbench run` to jobs: one run or a sweep, handed over to Hydra."""
+"""From the words of `tsbench run` to jobs: one run, or a sweep that Hydra's launcher starts.
+
+One run needs nothing of Hydra but its grammar and its composition of configurations (`config`). For
+sweeps, and to show what it knows, Hydra's own object is used, as `hydra.core.global_hydra` hands it
+out: `hydra.main` would read the words from the process's own command line.
+"""
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import os
 import re
 import sys
 import traceback
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-import hydra
-from hydra._internal.utils import get_args_parser
+from hydra import initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
@@ -31,8 +38,6 @@ LONGEST_NAME = 200  # characters; file systems allow 255 bytes
 CHECKED_JOBS = 1000  # of a sweep; later ones are checked when their turn comes
 PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads", "checkpoint")
 RESUME = "resume="
-OWN_SEARCH_PATH = ("config_path", "config_name", "config_dir", "experimental_rerun")
-NO_JOB = ("shell_completion", "hydra_help", "info")
 
 
 def launch(words: Sequence[str], json: Path | None = None) -> None:
@@ -44,79 +49,28 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
 
     Raises:
         TsbenchError: the words are wrong, or runs failed. The other runs of a sweep go on.
+        Stopped: by Ctrl-C or SIGTERM.
     """
-    parser = get_args_parser()
-    parser.error = _refuse
+    parser = _parser()
     flags = parser.parse_intermixed_args(list(words))
     if any(word.startswith(RESUME) for word in words):
         if len(words) > 1:
             raise TsbenchError("resume=RUN goes on with the run's own configuration: give it alone")
-        resumed = _resume(Path(words[0].removeprefix(RESUME)))
-        write_json(json, shown(RunDirectory(resumed).record()))
+        place = _resume(Path(words[0].removeprefix(RESUME)))
+    elif flags.cfg or flags.hydra_help or flags.info or flags.shell_completion:
+        _show(flags, parser)
         return
-    if json is not None and flags.multirun:
-        raise TsbenchError("--json is for one run; each of a sweep's has its score.json")
-    if not any(getattr(flags, name) for name in (*OWN_SEARCH_PATH, *NO_JOB)):
-        jobs = config.sweep(flags.overrides) if flags.multirun else [list(flags.overrides)]
-        places: set[str] = set()
-        for job in islice(jobs, CHECKED_JOBS):
-            chosen = config.compose(job)
-            run.prepare(chosen)
-            if chosen.directory in places:
-                raise TsbenchError(
-                    f"directory={chosen.directory} would be the place of several of the sweep's "
-                    "runs: without it each has its own"
-                )
-            if chosen.directory is not None:
-                places.add(chosen.directory)
-
-    failures: list[tuple[str, Path, Exception]] = []
-    parent = os.getpid()
-
-    @hydra.main(
-        version_base=config.VERSION_BASE,
-        config_path=f"pkg://{config.CONFIGURATIONS}",
-        config_name="config",
-    )
-    def start(node: DictConfig) -> float:
-        given = list(HydraConfig.get().overrides.task)
-        chosen = config.parse(node)
-        chosen = replace(chosen, directory=chosen.directory or str(directory(chosen, given)))
-        place = RunDirectory(Path(chosen.directory or ""))
-        try:
-            if flags.multirun:
-                reward = run.complete(chosen, given)
-                finish(place.path)
-                return reward
-            reward = run.execute(chosen, given).normalized_reward
-            finish(place.path)
-            write_json(json, shown(place.record()))
-            return reward
-        except Exception as error:
-            known = isinstance(error, TsbenchError)
-            # A launcher's worker has to let the failure travel back.
-            if os.getpid() != parent or not (known or flags.multirun):
-                raise
-            log = place.log_file
-            if not known and log.exists():
-                with log.open("a", encoding="utf-8") as file:
-                    traceback.print_exc(file=file)
-            failures.append((" ".join(given), log, error))
-            return float("nan")
-
-    options = [word for word in words if word not in flags.overrides]
-    sys.argv = [sys.argv[0], *options, *config.opened(flags.overrides)]
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra lets exceptions through instead of printing them
-    with config.one_line_errors():
-        start()
-    if failures and not flags.multirun:
-        raise failures[0][2]
-    for name, log, error in failures:
-        where = f" (log: {log})" if log.exists() else ""
-        reason = str(error) if isinstance(error, TsbenchError) else repr(error)
-        sys.stderr.write(f"tsbench: failed: {name}: {reason}{where}\n")
-    if failures:
-        raise TsbenchError(f"{len(failures)} of the sweep's runs failed (see above)")
+    elif flags.multirun:
+        if json is not None:
+            raise TsbenchError("--json is for one run; each of a sweep's has its score.json")
+        _sweep(flags.overrides)
+        return
+    else:
+        chosen = placed(config.compose(flags.overrides), flags.overrides)
+        run.execute(chosen, _own(flags.overrides))
+        place = Path(chosen.directory or "")
+        finish(place)
+    write_json(json, shown(RunDirectory(place).record()))
 
 
 def finish(directory: Path, console: Console | None = None) -> None:
@@ -142,6 +96,28 @@ def _stop(number: int) -> NoReturn:
     raise Stopped(number)
 
 
+def placed(chosen: RunConfig, words: Sequence[str]) -> RunConfig:
+    """The configuration with the run's directory in it: the one asked for or the standard one."""
+    return replace(chosen, directory=chosen.directory or str(directory(chosen, words)))
+
+
+def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
+    """The standard run directory; words that are not part of its name are added to it."""
+    name = f"seed{chosen.seed}-{chosen.budget}"
+    for word in _own(words):
+        key = word.lstrip("+~").split("=")[0]
+        if key not in PART_OF_THE_NAME:
+            name += "," + re.sub(r"[^\w.=-]+", "_", word.lstrip("+~"))
+    if len(name) > LONGEST_NAME:
+        name = name[:LONGEST_NAME] + "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
+    return RUNS / chosen.task.name / str(chosen.method["name"]) / name
+
+
+def _own(words: Sequence[str]) -> list[str]:
+    """The words that are about the run, not about Hydra."""
+    return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
+
+
 def _resume(place: Path) -> Path:
     """Goes on with a run: with its training, or with the pages of a finished one."""
     found = RunDirectory(place)
@@ -151,16 +127,108 @@ def _resume(place: Path) -> Path:
     return place
 
 
-def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
-    """The standard run directory; words that are not part of its name are added to it."""
-    name = f"seed{chosen.seed}-{chosen.budget}"
-    for word in words:
-        key = word.lstrip("+~").split("=")[0]
-        if key not in PART_OF_THE_NAME:
-            name += "," + re.sub(r"[^\w.=-]+", "_", word.lstrip("+~"))
-    if len(name) > LONGEST_NAME:
-        name = name[:LONGEST_NAME] + "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
-    return RUNS / chosen.task.name / str(chosen.method["name"]) / name
+def _sweep(words: Sequence[str]) -> None:
+    """Runs every combination of the values in the words, through Hydra's sweeper and launcher.
+
+    A launcher composes the configuration of its jobs where it starts them, perhaps on another
+    machine. They are composed here too, so that a mistake in the last one stops the first.
+    """
+    places: set[str] = set()
+    for job in islice(config.sweep(words), CHECKED_JOBS):
+        chosen = config.compose(job)
+        run.prepare(chosen)
+        if chosen.directory in places:
+            raise TsbenchError(
+                f"directory={chosen.directory} would be the place of several of the sweep's "
+                "runs: without it each has its own"
+            )
+        if chosen.directory is not None:
+            places.add(chosen.directory)
+    job_of_sweep = _Job()
+    with _hydra() as hydra:
+        hydra.multirun("config", job_of_sweep, [*config.opened(words), "hydra.mode=MULTIRUN"])
+    for name, log, error in job_of_sweep.failures:
+        where = f" (log: {log})" if log.exists() else ""
+        reason = str(error) if isinstance(error, TsbenchError) else repr(error)
+        sys.stderr.write(f"tsbench: failed: {name}: {reason}{where}\n")
+    if job_of_sweep.failures:
+        count = len(job_of_sweep.failures)
+        raise TsbenchError(f"{count} of the sweep's runs failed (see above)")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What Hydra's launcher calls for each job of a sweep, in this process or in a worker's.
+
+    Attributes:
+        process: that the sweep was started in.
+        failures: words, log and error of each job that has failed in that process.
+    """
+
+    process: int = field(default_factory=os.getpid)
+    failures: list[tuple[str, Path, Exception]] = field(default_factory=list)
+
+    def __call__(self, node: DictConfig) -> float:
+        """Does what is missing of a run, and returns its normalized reward; not a number for one
+        that has failed."""
+        words = list(HydraConfig.get().overrides.task)
+        chosen = placed(config.parse(node), words)
+        place = RunDirectory(Path(chosen.directory or ""))
+        try:
+            reward = run.complete(chosen, words)
+            finish(place.path)
+            return reward
+        except Exception as error:
+            if os.getpid() != self.process:
+                raise  # a worker has to let the failure travel back
+            if not isinstance(error, TsbenchError) and place.log_file.exists():
+                with place.log_file.open("a", encoding="utf-8") as file:
+                    traceback.print_exc(file=file)
+            self.failures.append((" ".join(words), place.log_file, error))
+            return float("nan")
+
+
+def _show(flags: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """What Hydra can tell about the words and itself."""
+    if flags.cfg:
+        run.prepare(config.compose(flags.overrides))
+    words = flags.overrides = config.opened(flags.overrides)
+    with _hydra() as hydra:
+        if flags.shell_completion:
+            hydra.shell_completion("config", words)
+        elif flags.hydra_help:
+            hydra.hydra_help("config", parser, flags)
+        elif flags.info:
+            hydra.show_info(flags.info, "config", words)
+        else:
+            hydra.show_cfg("config", words, flags.cfg, flags.package, flags.resolve)
+
+
+@contextmanager
+def _hydra() -> Iterator[Any]:
+    """Hydra, with tsbench's configurations. What it raises becomes one line."""
+    with (
+        config.one_line_errors(),
+        initialize_config_module(config.CONFIGURATIONS, version_base=config.VERSION_BASE),
+    ):
+        yield GlobalHydra.instance().hydra
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Of the words and of those of Hydra's flags that tsbench has, with Hydra's names."""
+    parser = argparse.ArgumentParser("tsbench run", add_help=False, allow_abbrev=False)
+    parser.error = _refuse  # type: ignore[method-assign]
+    parser.add_argument("overrides", nargs="*", help="key=value words")
+    flag = parser.add_argument
+    flag("--multirun", "-m", action="store_true", help="a sweep: run every combination of values")
+    flag("--cfg", "-c", choices=("job", "hydra", "all"), help="show the configuration and stop")
+    flag("--resolve", action="store_true", help="with --cfg: resolve interpolations")
+    flag("--package", "-p", help="with --cfg: show this part of the configuration")
+    flag("--hydra-help", action="store_true", help="show this help")
+    flag("--shell-completion", "-sc", action="store_true", help="install=SHELL, uninstall=SHELL")
+    topics = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+    flag("--info", "-i", nargs="?", const="all", choices=topics, help="show what Hydra has found")
+    return parser
 
 
 def _refuse(message: str) -> NoReturn:
