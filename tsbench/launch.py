@@ -144,15 +144,15 @@ def _sweep(words: Sequence[str]) -> None:
             )
         if chosen.directory is not None:
             places.add(chosen.directory)
-    job_of_sweep = _Job()
+    start = _Job()
     with _hydra() as hydra:
-        hydra.multirun("config", job_of_sweep, [*config.opened(words), "hydra.mode=MULTIRUN"])
-    for name, log, error in job_of_sweep.failures:
+        hydra.multirun("config", start, [*config.opened(words), "hydra.mode=MULTIRUN"])
+    for name, log, error in start.failures:
         where = f" (log: {log})" if log.exists() else ""
         reason = str(error) if isinstance(error, TsbenchError) else repr(error)
         sys.stderr.write(f"tsbench: failed: {name}: {reason}{where}\n")
-    if job_of_sweep.failures:
-        count = len(job_of_sweep.failures)
+    if start.failures:
+        count = len(start.failures)
         raise TsbenchError(f"{count} of the sweep's runs failed (see above)")
 
 

@@ -23,7 +23,7 @@ from tsbench.typed import typed
 
 M = TypeVar("M", Plan, ReferenceMotion)
 
-# The files that are named beside their directory elsewhere too; `RunDirectory` has all of them.
+# Names that `workspace` needs relative to the directory; `RunDirectory` has the paths of all files.
 METRICS = "metrics.jsonl"
 LOG = "log.txt"
 EVENTS = "tensorboard/events.out.tfevents.0"
