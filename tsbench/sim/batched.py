@@ -23,19 +23,12 @@ from tsbench.errors import NotFiniteError, TsbenchError
 from tsbench.sim.change import Change
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
+from tsbench.sim.quiet import QUIET
 from tsbench.state import Readings, Rng, S, Start, State
 from tsbench.task import MDP, SimulatedTask
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 _NUMBER = 1  # of a kind of warning, beside what it was about, in `Batch.warning`
-
-
-def _counted(message: str) -> None:
-    """mujoco's warnings are counted here; else each would go to the error stream, and to a file
-    in the current directory."""
-
-
-mujoco.set_mju_user_warning(_counted)
 
 
 class Dynamics(Protocol[S]):
@@ -124,7 +117,7 @@ class Physics(Generic[S]):
         self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self._qpos[rows] = start.qpos
         self._qvel[rows] = start.qvel
-        with _one_line():
+        with _computing():
             self.batch.forward(ids, stage=_CURRENT)
         self.seconds += perf_counter() - began
         return self._read(rows, start.time, start.memory)
@@ -136,7 +129,7 @@ class Physics(Generic[S]):
         self._force[at] = self.push_force(state.time, at)
         self.batch.warning[:] = 0
         began = perf_counter()
-        with _one_line():
+        with _computing():
             ids = None if rows is None else np.asarray(rows, np.int32)
             self.batch.step(ids, nstep=self.plant.substeps, stage=_CURRENT)
         self.seconds += perf_counter() - began
@@ -192,10 +185,11 @@ class Physics(Generic[S]):
 
 
 @contextmanager
-def _one_line() -> Iterator[None]:
-    """Tells in one line what mujoco refuses to compute."""
+def _computing() -> Iterator[None]:
+    """Silences mujoco's warnings, and tells in one line what it refuses to compute."""
     try:
-        yield
+        with QUIET:
+            yield
     except SimulationError as error:
         reason = " ".join(str(error).split())
         raise TsbenchError(f"the physics cannot go on: {reason}") from None

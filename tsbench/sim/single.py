@@ -20,6 +20,7 @@ from tsbench.sim.change import Change
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
+from tsbench.sim.quiet import QUIET
 from tsbench.state import Readings, State
 from tsbench.task import MDP, SimulatedTask
 
@@ -200,7 +201,8 @@ class ExactPhysics(dm_mujoco.Physics):
         """What dm_control wraps every computation in."""
         warnings = self.data.ptr.warning.number
         warnings[:] = 0
-        yield
+        with QUIET:
+            yield
         self.diverged = bool(warnings[UNSTABLE].any())
 
 
