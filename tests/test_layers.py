@@ -25,6 +25,7 @@ MAY_KNOW: dict[str, set[str]] = {
     **{module: set(CORE[:number]) for number, module in enumerate(CORE)},
     "gl": {"errors"},
     "curves": {"errors", "files"},
+    "events": {"errors"},
     "conf": set(),
     "planning": {*CORE},
     "checkpoint": {*CORE},
@@ -38,7 +39,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "config": {*CORE},
     "record": {*CORE, "tasks", "evaluation", "config"},
     "tables": {"evaluation", "record"},
-    "workspace": {*CORE, "checkpoint", "record", "tables"},
+    "workspace": {*CORE, "checkpoint", "events", "record", "tables"},
     "run": {
         *CORE, "sim", "tasks", "evaluation", "rl", "methods", "config", "record", "tables",
         "workspace",
@@ -63,7 +64,7 @@ ONLY_IN: dict[str, set[str]] = {
     "omegaconf": {"config", "launch"},
     "meshcat": {"viewer"},
     "matplotlib": {"curves", "viewer"},
-    "tensorboard": {"workspace"},
+    "tensorboard": {"events"},
     "rich": {"tables", "workspace", "run", "cli", "launch", "bench"},
 }
 STARTS_FAST = {"tsbench", "cli", "launch"}  # where an import may wait until it is needed

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.util.tensor_util import make_ndarray
 
 from tsbench import cli, config, run, tasks
 from tsbench.checkpoint import Checkpoints, decode, encode
@@ -98,8 +99,10 @@ def result(directory: Path) -> dict[str, Any]:
     events = EventAccumulator(str(directory / "tensorboard"))
     events.Reload()
     scalars = {
-        tag: [(scalar.step, scalar.value) for scalar in events.Scalars(tag)]
-        for tag in events.Tags()["scalars"]
+        tag: [
+            (event.step, make_ndarray(event.tensor_proto).item()) for event in events.Tensors(tag)
+        ]
+        for tag in events.Tags()["tensors"]
         if not tag.endswith("seconds")
     }
     return {

@@ -20,6 +20,7 @@ import pytest
 import yaml
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.util.tensor_util import make_ndarray
 
 from tsbench import cli, config, launch, record, run, tables, tasks
 from tsbench.errors import TsbenchError
@@ -133,9 +134,9 @@ def test_metrics_are_the_same_in_both_places(shown: tuple[Path, str]) -> None:
         steps = [row["steps"] for row in rows if row["stage"] == stage]
         assert steps == sorted(set(steps))
         losses = [row["value_loss"] for row in rows if row["stage"] == stage]
-        scalars = events.Scalars(f"{stage}/value_loss")
-        assert [scalar.step for scalar in scalars] == steps
-        assert np.allclose([scalar.value for scalar in scalars], losses)
+        shown_there = events.Tensors(f"{stage}/value_loss")
+        assert [event.step for event in shown_there] == steps
+        assert np.allclose([make_ndarray(event.tensor_proto) for event in shown_there], losses)
 
 
 def test_the_learning_curves_are_a_picture(shown: tuple[Path, str]) -> None:

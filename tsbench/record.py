@@ -26,7 +26,7 @@ M = TypeVar("M", Plan, ReferenceMotion)
 # Names that `workspace` needs relative to the directory; `RunDirectory` has the paths of all files.
 METRICS = "metrics.jsonl"
 LOG = "log.txt"
-EVENTS = "tensorboard/events.out.tfevents.0"
+EVENTS = "tensorboard"
 CHECKPOINTS = "checkpoints"
 
 

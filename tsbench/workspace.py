@@ -14,12 +14,10 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-from tensorboard.compat.proto.event_pb2 import Event
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.record_writer import RecordWriter
 
 from tsbench.checkpoint import Checkpoint, Checkpoints
 from tsbench.errors import Stopped, TsbenchError
+from tsbench.events import Events
 from tsbench.problem import Monitor, Snapshot
 from tsbench.record import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
 from tsbench.tables import duration, number
@@ -37,7 +35,7 @@ class Saved:
     Attributes:
         run: which run it belongs to.
         stages: the finished ones and the one under way.
-        sizes: bytes of the records that were written until then, by file.
+        sizes: bytes of the files that were written until then and are not written anew.
         learner: what the stage under way goes on from.
     """
 
@@ -122,8 +120,8 @@ class RunWorkspace:
     """A run directory in use: `metrics.jsonl`, TensorBoard events, `log.txt` and checkpoints.
 
     A `problem.Workspace`. Everything is written at once, line by line. In a directory that an
-    interrupted run left, the records go back to the newest checkpoint: what came after it is done
-    again.
+    interrupted run left, the metrics go back to the newest checkpoint, and the events with them:
+    what came after it is done again.
     """
 
     def __init__(
@@ -137,7 +135,8 @@ class RunWorkspace:
             run: tells this run from others: their checkpoints are refused.
 
         Raises:
-            TsbenchError: the checkpoints are another run's, or records have been cut since.
+            TsbenchError: the checkpoints are another run's, or the metrics have been cut since or
+                are damaged.
         """
         self.directory = directory
         self.stages: list[Stage] = []
@@ -151,11 +150,10 @@ class RunWorkspace:
             self._log = files.enter_context((directory / LOG).open("a", encoding="utf-8"))
             self._checkpoints = Checkpoints(directory / CHECKPOINTS, self.note)
             self._number, self._saved = self._newest()
-            self._records = {}
-            for name in (METRICS, EVENTS):
-                (directory / name).parent.mkdir(exist_ok=True)
-                self._records[name] = files.enter_context((directory / name).open("ab"))
+            self._metrics = files.enter_context((directory / METRICS).open("ab"))
             self._rewind()
+            self._events = Events(directory / EVENTS, directory / METRICS, self.note)
+            files.callback(self._events.close)
             self._files = files.pop_all()
 
     def _newest(self) -> tuple[int, Saved | None]:
@@ -169,22 +167,13 @@ class RunWorkspace:
         return checkpoint.stage, saved
 
     def _rewind(self) -> None:
-        """Drops from the records what will be done again."""
-        lost = 0
-        for name, file in self._records.items():
-            size = self._saved.sizes[name] if self._saved else 0
-            if file.tell() < size:
-                raise TsbenchError(
-                    f"{self.directory / name} has been cut since the last checkpoint"
-                )
-            if name == METRICS:
-                lost = (self.directory / name).read_bytes()[size:].count(b"\n")
-            file.truncate(size)
-            file.seek(0, os.SEEK_END)
-        # The record writer at the bottom of TensorBoard: no thread in which an error gets lost.
-        self._events = RecordWriter(self._records[EVENTS])
-        if not self._records[EVENTS].tell():
-            self._write_event(Event(wall_time=time.time(), file_version="brain.Event:2"))
+        """Drops from the metrics what will be done again."""
+        path, size = self.directory / METRICS, self._saved.sizes[METRICS] if self._saved else 0
+        if self._metrics.tell() < size:
+            raise TsbenchError(f"{path} has been cut since the last checkpoint")
+        lost = path.read_bytes()[size:].count(b"\n")
+        self._metrics.truncate(size)
+        self._metrics.seek(0, os.SEEK_END)
         if self._saved:
             stage = self._saved.stages[-1]
             self.note(f"resumed: {stage.name} goes on at {stage.steps:,} steps")
@@ -243,14 +232,10 @@ class RunWorkspace:
     def record(self, stage: Stage, metrics: Mapping[str, float]) -> None:
         """Appends an iteration's figures to `metrics.jsonl` and to the TensorBoard events."""
         row = {"stage": stage.name, "steps": stage.steps, "seconds": round(stage.seconds, 3)}
-        self._records[METRICS].write((json.dumps({**row, **metrics}) + "\n").encode())
-        self._records[METRICS].flush()
-        values = [
-            Summary.Value(tag=f"{stage.name}/{name}", simple_value=value)
-            for name, value in metrics.items()
-        ]
-        summary = Summary(value=values)
-        self._write_event(Event(wall_time=time.time(), step=stage.steps, summary=summary))
+        row |= metrics
+        self._metrics.write((json.dumps(row) + "\n").encode())
+        self._metrics.flush()
+        self._events.add(row)
 
     def keep(self, stage: Stage, snapshot: Callable[[], Snapshot]) -> None:
         """Saves a checkpoint if it is time: now and then, at the stage's end, before a stop.
@@ -261,12 +246,11 @@ class RunWorkspace:
         self._learning = True
         due = time.perf_counter() - self._saved_at >= self._interval
         if due or stage.steps >= stage.budget or self._stopped_by is not None:
-            for file in self._records.values():
-                os.fsync(file.fileno())
+            os.fsync(self._metrics.fileno())
             saved = Saved(
                 run=self._run,
                 stages=self.stages,
-                sizes={name: file.tell() for name, file in self._records.items()},
+                sizes={METRICS: self._metrics.tell()},
                 learner=dict(snapshot()),
             )
             number = len(self.stages) - 1
@@ -275,15 +259,11 @@ class RunWorkspace:
         if self._stopped_by is not None:
             raise Stopped(self._stopped_by)
 
-    def _write_event(self, event: Event) -> None:
-        self._events.write(event.SerializeToString())
-        self._events.flush()
-
 
 def _read(checkpoint: Checkpoint) -> Saved:
     try:
         saved: Saved = typed(Saved, checkpoint.content, "")
-        if len(saved.stages) != checkpoint.stage + 1 or saved.sizes.keys() != {METRICS, EVENTS}:
+        if len(saved.stages) != checkpoint.stage + 1 or saved.sizes.keys() != {METRICS}:
             raise TsbenchError("it lacks stages or records")
     except TsbenchError as error:
         raise TsbenchError(f"damaged checkpoint {checkpoint.path}: {error}") from None
