@@ -35,11 +35,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rsl_rl.algorithms import PPO
 
 import tsbench.launch  # noqa: F401  what a run imports, before the forks
 from tsbench import cli
 from tsbench.rl.ppo import Learner
+from tsbench.rl.rollout import Rollout
 from tsbench.sim.model import load_spec
 from tsbench.tasks.laikago import Laikago
 
@@ -429,19 +429,19 @@ class Campaign:
 
             def wrong(self: Any, *arguments: Any) -> None:
                 with torch.no_grad():
-                    self._ppo.actor.mlp[-1].bias[0] = np.nan
+                    self._actor.mlp[-1].bias[0] = np.nan
                 learn(self, *arguments)
 
             patch("tsbench.rl.ppo.Learner.learn", wrong)
 
         def loss() -> None:
-            compute = PPO.compute_returns
+            finish = Rollout.finish
 
             def wrong(self: Any, observation: Any) -> None:
-                compute(self, observation)
+                finish(self, observation)
                 self.storage.returns[0, 0] = np.nan
 
-            patch("rsl_rl.algorithms.PPO.compute_returns", wrong)
+            patch("tsbench.rl.rollout.Rollout.finish", wrong)
 
         for name, poison, says in (
             ("reward", reward, "reward of environment 3 is not finite at step "),

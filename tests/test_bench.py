@@ -17,7 +17,7 @@ from tsbench.bench.turns import Case, Effort, Range, take_turns
 from tsbench.cli import main
 from tsbench.errors import TsbenchError
 from tsbench.motion import ReferenceMotion
-from tsbench.rl.ppo import PPOSettings
+from tsbench.rl.settings import PPOSettings
 from tsbench.sim import gym, single
 from tsbench.sim.tracking import Imitation
 

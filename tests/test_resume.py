@@ -26,7 +26,8 @@ from tsbench.errors import Stopped, TsbenchError
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import Policy
 from tsbench.record import RunDirectory
-from tsbench.rl.ppo import Learner, PPOSettings
+from tsbench.rl.ppo import Learner
+from tsbench.rl.settings import PPOSettings
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
@@ -187,7 +188,9 @@ def test_a_crash_before_the_first_checkpoint(
     assert result(tmp_path / "run") == result(uninterrupted)
 
 
+@pytest.mark.parametrize("update", ["numpy", "rsl_rl"])
 def test_the_learner_goes_on_to_the_last_bit(
+    update: str,
     naive_reference: Callable[[str], ReferenceMotion],
 ) -> None:
     """On every kind of stage, from what came back from the disk, in a fresh one of another seed."""
@@ -204,7 +207,7 @@ def test_the_learner_goes_on_to_the_last_bit(
     )
     chosen = PPOSettings(
         environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,), entropy=0.01,
-        desired_kl=0.001, final_std=0.1,
+        desired_kl=0.001, final_std=0.1, update=update,
     )  # fmt: skip
 
     def learner(name: str, seed: int) -> Learner:
@@ -222,7 +225,7 @@ def test_the_learner_goes_on_to_the_last_bit(
 
     for name in subjects:
         whole = snapshots(learner(name, 1))
-        rates = {decode(each)["learning_rate"] for each in whole}
+        rates = {decode(each)["update"]["learning_rate"] for each in whole}
         assert len(rates) > 1, "the adaptive learning rate has to take part"
         second = learner(name, 2)
         second.restore(decode(whole[1]))

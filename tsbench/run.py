@@ -33,6 +33,7 @@ from tsbench.files import PART, taken, write_json, write_whole
 from tsbench.problem import Problem
 from tsbench.record import Record, RunDirectory
 from tsbench.rl.stages import KINDS, settings
+from tsbench.rl.threads import one_thread
 from tsbench.sim.model import compiled_hash
 from tsbench.workspace import RunWorkspace
 
@@ -162,7 +163,7 @@ def _work(
         interval=config.checkpoint,
         run=hashlib.sha256(identity.encode()).hexdigest(),
     )
-    with closing(workspace), signals(workspace.stop), memory_errors():
+    with closing(workspace), signals(workspace.stop), memory_errors(), one_thread():
         workspace.note(line)
         record = _train(config, problem, workspace, console)
         write_json(run.score_file, record.as_dict())  # last: it says that the run is finished

@@ -16,7 +16,8 @@ from tsbench.errors import NotFiniteError
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS, Policy
 from tsbench.problem import Budget, Problem
-from tsbench.rl.ppo import Learner, PPOSettings
+from tsbench.rl.ppo import Learner
+from tsbench.rl.settings import PPOSettings
 from tsbench.rl.stages import StageSettings, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment, Physics
@@ -26,11 +27,6 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
 
 TINY = PPOSettings(environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,))
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 def planning(distance: float = 3.0) -> Planning[Any]:
@@ -97,17 +93,23 @@ def test_steps_are_counted() -> None:
         assert 0.0 < metrics["episode_return"] < 15 * 0.9
 
 
-def test_rate_and_spread_fall_over_a_stage() -> None:
+@pytest.mark.parametrize("update", ["numpy", "rsl_rl"])
+def test_rate_and_spread_fall_over_a_stage(update: str) -> None:
     """By equal factors: four iterations of 128 steps take 1e-3 to 1e-5 in steps of 10^0.5."""
     settings = replace(
-        TINY, desired_kl=None, final_learning_rate=1e-5, initial_std=0.8, final_std=0.05
+        TINY,
+        desired_kl=None,
+        final_learning_rate=1e-5,
+        initial_std=0.8,
+        final_std=0.05,
+        update=update,
     )
     taught = learner(settings)
     reports: list[Mapping[str, float]] = []
     taught.learn(512, lambda _, metrics: reports.append(metrics))
     rates = [metrics["learning_rate"] for metrics in reports]
     np.testing.assert_allclose(rates, 1e-3 * 10.0 ** (-0.5 * np.arange(1, 5)))
-    assert taught._ppo.actor.distribution.log_std_param.max().exp().item() <= 0.05 + 1e-6
+    assert taught._actor.distribution.log_std_param.max().exp().item() <= 0.05 + 1e-6
 
 
 def test_weights_that_blow_up_are_noticed_at_once() -> None:
@@ -184,7 +186,7 @@ def test_the_artefact_is_the_actor(encoding: str) -> None:
     assert policy.info.layers == (7, 16, 3)
     assert (policy.info.task, policy.info.method) == ("rocket_navigation", "test")
     environment = TorchEnvironment(taught.environment, encoding)
-    actor = taught._ppo.actor
+    actor = taught._actor
     actor.eval()
     with torch.inference_mode():
         expected = actor(environment.get_observations()).clamp(-1.0, 1.0).numpy()
@@ -250,7 +252,7 @@ def test_held_actions_are_counted_as_steps() -> None:
     taught.learn(385, lambda steps, metrics: reports.append((steps, dict(metrics))))
     assert [steps for steps, _ in reports] == [384, 768]
     assert reports[-1][1]["episode_length"] == 15.0
-    assert taught._ppo.gamma == pytest.approx(0.729)
+    assert taught._rollout._discount == pytest.approx(0.729)
 
 
 @pytest.mark.parametrize(
@@ -277,22 +279,20 @@ def test_a_learner_is_told_of_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
     taught = learner(replace(TINY, discount=0.9, bootstrap=False), subject=near)
     told: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
     earned: list[torch.Tensor] = []
-    step, process = taught._env.step, taught._ppo.process_env_step
+    step, add = taught._env.step, taught._rollout.add
 
     def stepped(actions: torch.Tensor) -> Any:
         given = step(actions)
         earned.append(given[1].clone())
         return given
 
-    def processed(
-        observation: Any, rewards: torch.Tensor, dones: torch.Tensor, extras: Any
-    ) -> None:
+    def added(rewards: torch.Tensor, dones: torch.Tensor, extras: Any) -> None:
         assert "time_outs" not in extras
         told.append((rewards.clone(), dones, extras["spared"]))
-        process(observation, rewards, dones, extras)
+        add(rewards, dones, extras)
 
     monkeypatch.setattr(taught._env, "step", stepped)
-    monkeypatch.setattr(taught._ppo, "process_env_step", processed)
+    monkeypatch.setattr(taught._rollout, "add", added)
     taught.learn(1024)
     arrivals, returns, running = 0, [], np.zeros(8)
     for own, (rewards, dones, spared) in zip(earned, told, strict=True):
@@ -371,6 +371,12 @@ def test_finetuning_is_pushed_as_hard_as_the_imitation_was_in_the_end() -> None:
         ({"desired_kl": 0.0}, r"desired_kl"),
         ({"entropy": float("inf")}, r"entropy"),
         ({"value_weight": -1.0}, r"value_weight"),
+        ({"update": "torch"}, r"plan\.update must be one of auto, numpy, rsl_rl"),
+        ({"optimizer": "lion"}, r"plan\.optimizer must be one of adam, adamw, rmsprop, sgd"),
+        (
+            {"update": "numpy", "optimizer": "sgd", "minibatch_advantages": True},
+            r"update must be rsl_rl or auto for optimizer: sgd, minibatch_advantages: True$",
+        ),
         ({"disturb": {"push": 9.0}}, r"plan\.disturb: planning has no physics to disturb"),
     ],
 )

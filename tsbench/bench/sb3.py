@@ -35,8 +35,9 @@ from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS
 from tsbench.problem import Problem
 from tsbench.record import RunDirectory
-from tsbench.rl.ppo import PPOSettings
+from tsbench.rl.settings import PPOSettings
 from tsbench.rl.stages import settings
+from tsbench.rl.threads import one_thread
 from tsbench.run import prepare
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
@@ -85,6 +86,7 @@ class Outcome:
         )
 
 
+@one_thread()
 def compare(name: str, effort: Effort) -> Findings:
     problem = prepare(compose([f"task={name}", f"budget={effort.budget}"]))
     with tempfile.TemporaryDirectory() as folder:

@@ -8,7 +8,8 @@ from typing import Any
 
 from tsbench.errors import TsbenchError, unknown
 from tsbench.problem import Monitor, Problem, Workspace
-from tsbench.rl.ppo import Learner, PPOSettings, Report
+from tsbench.rl.ppo import Learner, Report
+from tsbench.rl.settings import PPOSettings
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning

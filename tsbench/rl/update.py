@@ -1,28 +1,139 @@
-"""PPO's update of small networks, without a framework's overhead.
+"""PPO's update: rsl-rl's own, and the same in numpy for small networks on the CPU.
 
 rsl-rl's update of a network of 64 x 64 units by 256 actions takes torch five times as long as its
-arithmetic does: some 250 small operations, each dispatched, recorded and differentiated. Here the
-same update (tests/rl/test_update.py holds the two against each other) has its gradients written
-out in numpy, on the memory of torch's parameters.
+arithmetic does: some 250 small operations, each dispatched, recorded and differentiated. In numpy
+the gradients are written out, on the memory of torch's parameters. tests/rl/test_update.py holds
+the two updates against each other.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
 from torch import nn
 
+from tsbench.errors import TsbenchError
+from tsbench.rl.settings import PPOSettings
+
+WIDE = 512  # units of a hidden layer from which numpy gains less than a third (docs/speed.md)
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8  # of Adam (Kingma and Ba 2015), as torch's defaults
 KL_RATES = (1e-5, 1e-2)  # that rsl-rl's adaptive learning rate stays between
 KL_FACTOR = 1.5  # by which that changes it
 KL_ROUNDING = 1e-12  # more than the divergence of a policy from itself, which says nothing about it
 
 Array = np.ndarray  # float32, as torch's
+
+
+class Update(Protocol):
+    """Improves an actor and a critic by the steps in a storage.
+
+    Attributes:
+        learning_rate: of both networks, in the next update.
+    """
+
+    learning_rate: float
+
+    def update(self) -> dict[str, float]:
+        """Epochs over minibatches of the stored steps, shuffled once; empties the storage and
+        updates the normalisers. Returns the mean losses, `value` and `surrogate` among them."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """What the next update depends on beside the networks: plain values, and arrays that it
+        will change."""
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from where `snapshot` was taken."""
+
+
+def make_update(
+    actor: MLPModel, critic: MLPModel, storage: RolloutStorage, settings: PPOSettings
+) -> Update:
+    """The update that `settings.update` names.
+
+    `auto` takes the one in numpy where the networks are on the CPU, every hidden layer has fewer
+    than `WIDE` units, and numpy's implements all settings. Elsewhere it takes rsl-rl's.
+
+    Raises:
+        TsbenchError: numpy's is asked for networks that are not on the CPU.
+    """
+    on_cpu = torch.device(storage.device).type == "cpu"
+    if settings.update == "numpy" and not on_cpu:
+        raise TsbenchError(f"update: numpy works on the CPU, not on {storage.device}")
+    small = on_cpu and max(settings.hidden) < WIDE and not settings.beyond_numpy
+    if settings.update == "numpy" or (settings.update == "auto" and small):
+        return NumpyUpdate(actor, critic, storage, settings)
+    return RslUpdate(actor, critic, storage, settings)
+
+
+class RslUpdate:
+    """rsl-rl's own, on any device. An `Update`."""
+
+    def __init__(
+        self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, settings: PPOSettings
+    ) -> None:
+        self._ppo = PPO(
+            actor,
+            critic,
+            storage,
+            num_learning_epochs=settings.epochs,
+            num_mini_batches=settings.minibatches,
+            clip_param=settings.clip,
+            value_loss_coef=settings.value_weight,
+            entropy_coef=settings.entropy,
+            learning_rate=settings.learning_rate,
+            max_grad_norm=settings.gradient_norm,
+            optimizer=settings.optimizer,
+            use_clipped_value_loss=settings.clip_value,
+            schedule="fixed" if settings.desired_kl is None else "adaptive",
+            desired_kl=settings.desired_kl,
+            normalize_advantage_per_mini_batch=settings.minibatch_advantages,
+            device=str(storage.device),
+        )
+
+    @property
+    def learning_rate(self) -> float:
+        return self._ppo.learning_rate
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float) -> None:
+        self._ppo.learning_rate = rate
+        for group in self._ppo.optimizer.param_groups:
+            group["lr"] = rate
+
+    def update(self) -> dict[str, float]:
+        return self._ppo.update()
+
+    def snapshot(self) -> dict[str, Any]:
+        state = self._ppo.optimizer.state_dict()["state"]
+        return {
+            "learning_rate": self.learning_rate,
+            "optimizer": {
+                str(parameter): {
+                    name: value.cpu().numpy() if isinstance(value, torch.Tensor) else value
+                    for name, value in values.items()
+                }
+                for parameter, values in state.items()
+            },
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        optimizer = self._ppo.optimizer
+        state = {
+            int(parameter): {
+                name: torch.tensor(value) if isinstance(value, np.ndarray) else value
+                for name, value in values.items()
+            }
+            for parameter, values in snapshot["optimizer"].items()
+        }
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+        self.learning_rate = snapshot["learning_rate"]
 
 
 def _elu(x: Array, out: Array) -> None:
@@ -157,30 +268,48 @@ class Network:
             moment[:] = snapshot[name]
 
 
-class LeanPPO(PPO):
-    """rsl-rl's PPO with a Gaussian policy, of one spread for all states, and its own update.
+class NumpyUpdate:
+    """rsl-rl's update of a Gaussian policy that has one spread for all states, in numpy. An
+    `Update`.
 
     Attributes:
         learning_rate: of both networks, in the next update.
-        policy: the actor's parameters.
-        value: the critic's.
     """
 
     learning_rate: float
-    desired_kl: float | None
 
-    def __init__(self, *arguments: Any, activation: str, **settings: Any) -> None:
-        """`activation` is a name in `policy.ACTIVATIONS`, the rest rsl-rl's."""
-        super().__init__(*arguments, **settings)
-        self.policy = Network(self.actor, activation, self.max_grad_norm)
-        self.value = Network(self.critic, activation, self.max_grad_norm)
+    def __init__(
+        self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, settings: PPOSettings
+    ) -> None:
+        """Moves the networks' parameters to memory of numpy's; they have to be on the CPU."""
+        self.learning_rate = settings.learning_rate
+        self._settings = settings
+        self._actor = actor
+        self._critic = critic
+        self._storage = storage
+        self._policy = Network(actor, settings.activation, settings.gradient_norm)
+        self._value = Network(critic, settings.activation, settings.gradient_norm)
+
+    def snapshot(self) -> dict[str, Any]:
+        return {
+            "learning_rate": self.learning_rate,
+            "policy": self._policy.snapshot(),
+            "value": self._value.snapshot(),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        self._policy.restore(snapshot["policy"])
+        self._value.restore(snapshot["value"])
+        self.learning_rate = snapshot["learning_rate"]
 
     def update(self) -> dict[str, float]:
-        """Epochs over minibatches of the stored steps, shuffled once, as rsl-rl does. Returns the
-        mean losses."""
-        storage = self.storage
-        size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
-        order = torch.randperm(size * self.num_mini_batches)
+        storage, epochs, minibatches = (
+            self._storage,
+            self._settings.epochs,
+            self._settings.minibatches,
+        )
+        size = storage.num_envs * storage.num_transitions_per_env // minibatches
+        order = torch.randperm(size * minibatches)
         observation = storage.observations.flatten(0, 1)
 
         def split(steps: torch.Tensor) -> list[Array]:
@@ -188,8 +317,8 @@ class LeanPPO(PPO):
             return [shuffled[i : i + size] for i in range(0, len(shuffled), size)]
 
         with torch.no_grad():
-            seen = split(self.actor.get_latent(observation))
-            valued = split(self.critic.get_latent(observation))
+            seen = split(self._actor.get_latent(observation))
+            valued = split(self._critic.get_latent(observation))
             mean, spread = (split(p.flatten(0, 1)) for p in storage.distribution_params)
         actions, log_prob, advantage, returns, values = (
             split(steps.flatten(0, 1))
@@ -200,18 +329,18 @@ class LeanPPO(PPO):
         )  # fmt: skip
         losses = np.zeros(2)
         with np.errstate(all="ignore"):  # the learner looks at what comes out
-            for _ in range(self.num_learning_epochs):
-                for i in range(self.num_mini_batches):
+            for _ in range(epochs):
+                for i in range(minibatches):
                     losses += (
                         self._update_policy(
                             seen[i], actions[i], log_prob[i], advantage[i], mean[i], spread[i]
                         ),
                         self._update_value(valued[i], returns[i], values[i]),
                     )
-        self.actor.update_normalization(observation)
-        self.critic.update_normalization(observation)
+        self._actor.update_normalization(observation)
+        self._critic.update_normalization(observation)
         storage.clear()
-        surrogate, value = losses / (self.num_learning_epochs * self.num_mini_batches)
+        surrogate, value = losses / (epochs * minibatches)
         return {"value": float(value), "surrogate": float(surrogate)}
 
     def _update_policy(
@@ -221,25 +350,26 @@ class LeanPPO(PPO):
         """The clipped surrogate and the entropy bonus (Schulman et al. 2017, eq. 7 and 9); sets
         the learning rate where that is adapted. Arrays are (batch, ...) and what was when the
         actions were taken."""
-        now = self.policy.forward(seen)
-        log_std = self.policy.log_std
+        s = self._settings
+        now = self._policy.forward(seen)
+        log_std = self._policy.log_std
         std = np.exp(log_std)
-        if self.desired_kl is not None and self.schedule == "adaptive":
-            self._adapt(self.desired_kl, mean, spread, now, std)
+        if s.desired_kl is not None:
+            self._adapt(s.desired_kl, mean, spread, now, std)
         z = (actions - now) / std
         constant = 0.5 * math.log(2.0 * math.pi) * log_std.size
         new = -0.5 * np.sum(z * z, axis=1, keepdims=True) - (np.sum(log_std) + constant)
         ratio = np.exp(new - log_prob)
-        low, high = 1.0 - self.clip_param, 1.0 + self.clip_param
+        low, high = 1.0 - s.clip, 1.0 + s.clip
         gain = advantage * ratio
         clipped = advantage * np.clip(ratio, low, high)
         # Where clipping makes the gain smaller it does not depend on the policy any more.
         by_log_prob = np.where(clipped < gain, np.float32(0.0), gain) * np.float32(-1.0 / len(gain))
-        self.policy.backward(by_log_prob * z / std)
+        self._policy.backward(by_log_prob * z / std)
         by_log_std = by_log_prob * (z * z - 1.0)
-        np.sum(by_log_std, axis=0, out=self.policy.log_std_gradient)
-        self.policy.log_std_gradient -= self.entropy_coef
-        self.policy.step(self.learning_rate)
+        np.sum(by_log_std, axis=0, out=self._policy.log_std_gradient)
+        self._policy.log_std_gradient -= s.entropy
+        self._policy.step(self.learning_rate)
         return -float(np.mean(np.minimum(gain, clipped)))
 
     def _adapt(self, wanted: float, mean: Array, spread: Array, now: Array, std: Array) -> None:
@@ -252,15 +382,16 @@ class LeanPPO(PPO):
             self.learning_rate = min(KL_RATES[1], self.learning_rate * KL_FACTOR)
 
     def _update_value(self, seen: Array, returns: Array, values: Array) -> float:
-        now = self.value.forward(seen)
+        s = self._settings
+        now = self._value.forward(seen)
         error = now - returns
         square = error * error
-        if self.use_clipped_value_loss:
+        if s.clip_value:
             change = now - values
-            bounded = values + np.clip(change, -self.clip_param, self.clip_param) - returns
+            bounded = values + np.clip(change, -s.clip, s.clip) - returns
             worse = bounded * bounded
             error = np.where(worse > square, np.float32(0.0), error)
             square = np.maximum(square, worse)
-        self.value.backward(error * np.float32(2.0 * self.value_loss_coef / len(error)))
-        self.value.step(self.learning_rate)
+        self._value.backward(error * np.float32(2.0 * s.value_weight / len(error)))
+        self._value.step(self.learning_rate)
         return float(np.mean(square))

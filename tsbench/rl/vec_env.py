@@ -15,15 +15,20 @@ from tsbench.sim.batched import BatchedEnvironment
 
 
 class TorchEnvironment(VecEnv):
-    """Float32 tensors on the CPU over a batched environment, its observations encoded, and each
-    action held for some steps.
+    """Float32 tensors over a batched environment, its observations encoded, and each action held
+    for some steps.
 
     Attributes:
+        device: where the tensors are, in torch's words.
         cfg: nothing; rsl-rl asks for it.
     """
 
     def __init__(
-        self, environment: BatchedEnvironment[Any], encoding: str = "plain", repeat: int = 1
+        self,
+        environment: BatchedEnvironment[Any],
+        encoding: str = "plain",
+        repeat: int = 1,
+        device: str = "cpu",
     ) -> None:
         """`encoding` is a name in `policy.ENCODINGS`; `repeat` the steps of an action."""
         mdp = environment.mdp
@@ -33,7 +38,7 @@ class TorchEnvironment(VecEnv):
         self.num_envs = environment.count
         self.num_actions = mdp.action_size
         self.max_episode_length = mdp.horizon
-        self.device = "cpu"
+        self.device = device
         self.cfg: dict[str, Any] = {}
         self._observation = self._tensors(environment.reset())
 
@@ -52,7 +57,7 @@ class TorchEnvironment(VecEnv):
         waits for its first action with one of zeros. Extras, each of shape (num_envs,):
         `time_outs`, whether an episode ended with its last step; `spared`, how many steps one that
         ended at its goal did not need."""
-        held = actions.numpy().astype("float64")
+        held = actions.numpy(force=True).astype("float64")
         transition = self.environment.step(held)
         reward = transition.reward
         terminal, time_outs = transition.terminal, transition.truncated
@@ -66,19 +71,19 @@ class TorchEnvironment(VecEnv):
             terminal = terminal | (transition.terminal & ~over)
             time_outs = time_outs | (transition.truncated & ~over)
         self._observation = self._tensors(transition.observation)
-        rewards = torch.from_numpy(reward / self.repeat).float()
-        dones = torch.from_numpy(terminal | time_outs).long()
+        rewards = self._floats(reward / self.repeat)
+        dones = torch.from_numpy(terminal | time_outs).to(self.device, torch.long)
         extras = {"time_outs": time_outs, "spared": spared}
         return (
             self._observation,
             rewards,
             dones,
-            {name: torch.from_numpy(values).float() for name, values in extras.items()},
+            {name: self._floats(values) for name, values in extras.items()},
         )
 
     def snapshot(self) -> dict[str, Any]:
         """The environment's, with the observation that the next action answers."""
-        observation = {name: tensor.numpy() for name, tensor in self._observation.items()}
+        observation = {name: tensor.numpy(force=True) for name, tensor in self._observation.items()}
         return {"observation": observation, "environment": self.environment.snapshot()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -91,5 +96,8 @@ class TorchEnvironment(VecEnv):
         environment = self.environment
         value = environment.mdp.value_observation(environment.state)
         encoded = {"policy": self._encode(observation), "value": self._encode(value)}
-        tensors = {name: torch.from_numpy(group).float() for name, group in encoded.items()}
+        tensors = {name: self._floats(group) for name, group in encoded.items()}
         return TensorDict(tensors, batch_size=[self.num_envs])
+
+    def _floats(self, values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(values).to(self.device, torch.float32)
