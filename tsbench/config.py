@@ -43,7 +43,7 @@ class TaskConfig:
     Attributes:
         name: a registered task.
         budgets: the budgets on offer, by name.
-        training: changes to the PPO settings by kind of stage (`rl.stages.KINDS`).
+        training: changes to the PPO settings by kind of stage (a method's `STAGES`).
         constants: changed constants of the task, for studies; such a score cannot be ranked.
     """
 

@@ -34,7 +34,7 @@ class Problem:
     Attributes:
         task: in full physics.
         budget: environment steps of each kind.
-        training: changes to the PPO settings by kind of stage (`rl.stages.KINDS`).
+        training: changes to the PPO settings by kind of stage (a method's `STAGES`).
         options: of the method, as its config has them.
         seed: of all randomness.
         threads: for the physics, or None for all cores.

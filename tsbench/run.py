@@ -32,9 +32,10 @@ from tsbench.evaluation.score import Score
 from tsbench.files import PART, taken, write_json, write_whole
 from tsbench.problem import Problem
 from tsbench.record import Record, RunDirectory
-from tsbench.rl.stages import KINDS, settings
+from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
 from tsbench.sim.model import compiled_hash
+from tsbench.typed import unknown_key
 from tsbench.workspace import RunWorkspace
 
 # What can change a number in a run.
@@ -73,8 +74,12 @@ def prepare(config: RunConfig) -> Problem:
         seed=config.seed,
         threads=config.threads,
     )
-    methods.options(methods.find(config.method["name"]).Options, problem)
-    for kind in dict.fromkeys([*KINDS, *config.task.training]):
+    name = config.method["name"]
+    methods.options(methods.find(name).Options, problem)
+    known = {kind for method in methods.names() for kind in methods.stages(method)}
+    for kind in dict.fromkeys([*methods.stages(name), *config.task.training]):
+        if kind not in known:
+            raise unknown_key("task.training", kind, known)
         settings(problem, kind)
     return problem
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from tsbench import TsbenchError, methods, tasks
 from tsbench.config import compose
@@ -19,6 +20,8 @@ from tsbench.methods import twostage
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.policy import Policy, PolicyInfo
 from tsbench.problem import Budget, Problem, Snapshot
+from tsbench.rl.stages import settings
+from tsbench.run import prepare
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
 from tsbench.task import plannable
@@ -65,11 +68,6 @@ class Scribe:
     ) -> None:
         assert all(np.isfinite(value) for value in metrics.values())
         self.steps.append(steps)
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 def problem(task_name: str, seed: int = 0, constants: Any = None, **options: Any) -> Problem:
@@ -194,6 +192,38 @@ def test_options_that_make_no_sense(
 ) -> None:
     with pytest.raises(TsbenchError, match=message):
         methods.find(method).train(problem("rocket_navigation", **options), Desk(tmp_path))
+
+
+def test_stages_of_another_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A method brings its own kinds of stages; those of no method are refused."""
+    distilled = ModuleType("distilled")
+    vars(distilled).update(Options=Nothing, train=lambda *_: None, STAGES=("distill",))
+    names = (*methods.names(), "distilled")
+    monkeypatch.setitem(sys.modules, "tsbench.methods.distilled", distilled)
+    given = compose(["task=rocket_navigation"])
+
+    def prepared(method: str, **training: Any) -> Problem:
+        changed = replace(given.task, training={**given.task.training, **training})
+        return prepare(replace(given, task=changed, method={"name": method}))
+
+    with pytest.raises(TsbenchError, match=r"unknown key in task\.training 'distill'; allowed: "):
+        prepared("twostage", distill={"clip": 0.3})
+    monkeypatch.setattr(methods, "names", lambda: names)
+    for method in ("distilled", "twostage"):
+        ready = prepared(method, distill={"clip": 0.3})
+        assert settings(ready, "distill").clip == 0.3
+    with pytest.raises(TsbenchError, match=r"task\.training\.distill 'cilp'.*mean 'clip'"):
+        prepared("distilled", distill={"cilp": 0.3})
+    with pytest.raises(TsbenchError, match=r"task\.training 'distil';.*mean 'distill'") as caught:
+        prepared("distilled", distil={})
+    assert "\n" not in str(caught.value)
+    del vars(distilled)["STAGES"]
+    assert methods.stages("distilled") == ()
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """A method without options."""
 
 
 def test_no_such_method() -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,10 +16,10 @@ from tsbench import TsbenchError, tasks
 from tsbench.errors import NotFiniteError
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import ENCODINGS, Policy
-from tsbench.problem import Budget, Problem
+from tsbench.problem import Budget, Problem, Workspace
 from tsbench.rl.ppo import Learner
 from tsbench.rl.settings import PPOSettings
-from tsbench.rl.stages import StageSettings, settings
+from tsbench.rl.stages import StageSettings, learn_planning, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances
@@ -110,6 +111,42 @@ def test_rate_and_spread_fall_over_a_stage(update: str) -> None:
     rates = [metrics["learning_rate"] for metrics in reports]
     np.testing.assert_allclose(rates, 1e-3 * 10.0 ** (-0.5 * np.arange(1, 5)))
     assert taught._actor.distribution.log_std_param.max().exp().item() <= 0.05 + 1e-6
+
+
+def test_planning_is_one_course_of_learning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Episodes begin at sampled states in the first half of the steps; rates fall once."""
+    explored: list[tuple[int, float]] = []
+    begin, reports = Planning.begin, []  # type: ignore[var-annotated]
+
+    def began(self: Planning[Any], rng: np.random.Generator, rows: np.ndarray) -> Any:
+        explored.append((len(reports), self.explore))
+        return begin(self, rng, rows)
+
+    monkeypatch.setattr(Planning, "begin", began)
+
+    class Scribe:
+        saved = None
+
+        def update(self, steps: int, metrics: Mapping[str, float], _: Any) -> None:
+            reports.append((steps, metrics["learning_rate"]))
+
+    class Desk:
+        stage = staticmethod(lambda name, steps: nullcontext(Scribe()))
+
+    changes = {
+        "environments": 8, "rollout": 16, "minibatches": 2, "hidden": [16], "desired_kl": None,
+        "final_learning_rate": 1e-5,
+    }  # fmt: skip
+    given = replace(
+        problem(plan=changes), task=tasks.make("rocket_navigation", distance=3.0), seed=1
+    )
+    learn_planning(given, cast(Workspace, Desk()), 4 * 128, explore=0.75)
+    assert [steps for steps, _ in reports] == [128, 256, 384, 512]
+    np.testing.assert_allclose(
+        [rate for _, rate in reports], 1e-3 * 10.0 ** (-0.5 * np.arange(1, 5))
+    )
+    shares = [{share for done, share in explored if done == number} for number in range(4)]
+    assert shares == [{0.75}, {0.75}, {0.0}, {0.0}]
 
 
 def test_weights_that_blow_up_are_noticed_at_once() -> None:
@@ -384,8 +421,3 @@ def test_settings_that_make_no_sense(changes: dict[str, Any], message: str) -> N
     with pytest.raises(TsbenchError, match=message) as caught:
         settings(problem(plan=changes), "plan")
     assert "\n" not in str(caught.value)
-
-
-def test_no_such_stage() -> None:
-    with pytest.raises(TsbenchError, match=r"'task.training.imitat'.*allowed"):
-        settings(problem(), "imitat")

@@ -1,7 +1,7 @@
 """The methods. A new one is one file here and one config in conf/method/.
 
 `tsbench.methods.NAME` has a dataclass `Options` and a function
-`train(problem, workspace) -> Policy`.
+`train(problem, workspace) -> Policy`; with PPO stages it names their kinds in `STAGES`.
 """
 
 from __future__ import annotations
@@ -59,6 +59,16 @@ def find(name: str) -> Method:
         if not hasattr(module, part):
             raise TsbenchError(f"the method {name} has no {part} (see tsbench.methods.Method)")
     return cast(Method, module)
+
+
+def stages(name: str) -> tuple[str, ...]:
+    """The kinds of PPO stages that a method has, whose settings `task.training` may change: the
+    method's `STAGES`, or none where it names none.
+
+    Raises:
+        TsbenchError: there is no such method, or it lacks a part.
+    """
+    return tuple(getattr(find(name), "STAGES", ()))
 
 
 def options(kind: type[Any], problem: Problem) -> Any:

@@ -9,6 +9,8 @@ from tsbench.policy import Policy
 from tsbench.problem import Problem, Workspace
 from tsbench.rl.stages import learn_physics
 
+STAGES = ("task",)
+
 
 @dataclass(frozen=True)
 class Options:

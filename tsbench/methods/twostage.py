@@ -20,6 +20,8 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
 from tsbench.task import plannable
 
+STAGES = ("plan", "imitate", "finetune")
+
 
 @dataclass(frozen=True)
 class Options:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tsbench.errors import TsbenchError, unknown
+from tsbench.errors import TsbenchError
 from tsbench.problem import Monitor, Problem, Workspace
 from tsbench.rl.ppo import Learner, Report
 from tsbench.rl.settings import PPOSettings
@@ -15,8 +15,6 @@ from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
 from tsbench.task import SimulatedTask
 from tsbench.typed import typed_items
-
-KINDS = ("plan", "imitate", "task", "finetune")
 
 
 @dataclass(frozen=True)
@@ -31,11 +29,12 @@ class StageSettings(PPOSettings):
 def settings(problem: Problem, kind: str) -> StageSettings:
     """The settings of a kind of stage.
 
+    Kinds are the names that methods give in their `STAGES`. Two have rules of their own: `plan` has
+    no physics that could be disturbed, and `finetune` begins with the settings of `imitate`.
+
     Raises:
         TsbenchError: unknown names or values of the wrong type or range.
     """
-    if kind not in KINDS:
-        raise unknown("kind of stage", f"task.training.{kind}", KINDS)
     changes = _changes(problem, kind)
     if (most := problem.budget.environments) is not None:
         changes["environments"] = min(changes.get("environments", most), most)
@@ -72,7 +71,8 @@ def _changes(problem: Problem, kind: str) -> dict[str, Any]:
 def learn_planning(
     problem: Problem, workspace: Workspace, steps: int, explore: float = 0.0
 ) -> Learner:
-    """PPO on the planning variant; `explore` as in `Planning`, for the first half of the steps.
+    """PPO on the planning variant; `explore` as in `Planning`, in iterations that begin in the
+    first half of the steps.
 
     Sampled states show what pays near the goal before the way there is known; starts from the
     task's own start then give that way its due.
@@ -80,12 +80,13 @@ def learn_planning(
     chosen = settings(problem, "plan")
     planning: Planning[Any] = Planning(problem.task, explore=explore)
     environment = BatchedEnvironment(planning, planning, chosen.environments, problem.seed)
+
+    def prepare(taken: int) -> None:
+        planning.explore = explore if taken < steps // 2 else 0.0
+
     with workspace.stage("plan", steps) as monitor:
         learner = Learner(environment, chosen, problem.seed)
-        report = _reporting(learner, monitor)
-        learner.learn(steps // 2, report)
-        planning.explore = 0.0
-        learner.learn(steps, report)
+        learner.learn(steps, _reporting(learner, monitor), prepare)
     return learner
 
 
