@@ -13,7 +13,7 @@ from tensordict import TensorDict
 class Rollout:
     """Collects steps in rsl-rl's storage and computes their returns and advantages.
 
-    This is the first half of rsl-rl's `PPO`, to the last bit (tests/rl/test_rollout.py). `PPO` does
+    This is the first half of rsl-rl's `PPO`, to the last bit (tests/rl/test_update.py). `PPO` does
     not collect without building an optimiser, for which the update in numpy has no use. As there,
     all methods are called under `torch.inference_mode`.
 
