@@ -72,7 +72,12 @@ def os_errors(path: Path | str) -> Iterator[None]:
         raise TsbenchError(f"{error.filename or path}: {error.strerror or error}") from None
 
 
-_NO_MEMORY = ("allocate memory", "start new thread", "Resource temporarily unavailable")
+_NO_MEMORY = (
+    "allocate memory",
+    "start new thread",
+    "Resource temporarily unavailable",
+    "Caught an unknown exception!",  # mujoco's MjSpec, of a C++ bad_alloc
+)
 
 
 @contextmanager
