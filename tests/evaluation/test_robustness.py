@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, fields, replace
 from typing import Any, cast
 
@@ -144,9 +147,11 @@ SMALL = Protocol(
 
 
 @pytest.mark.parametrize("name", ["laikago_trot", "rocket_navigation"])
-def test_a_push_played_from_its_moment_is_the_whole_episode(name: str) -> None:
+def test_a_push_played_from_its_moment_is_the_whole_episode(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is gone on from shortly before the push is what the dm_control environment plays from
-    the start, with no reset on the way."""
+    the start, with no reset on the way; in blocks of pushes as with all side by side."""
     task = tasks.make(name)
     still = np.zeros(task.action_size)
     if name == "rocket_navigation":
@@ -160,6 +165,9 @@ def test_a_push_played_from_its_moment_is_the_whole_episode(name: str) -> None:
     assert len(phases) >= 3
     survived, unpushed = survival(policy, task, forces, phases, SMALL, threads=1)
     assert survived.shape == (2, 3, len(phases))
+    monkeypatch.setattr("tsbench.evaluation.robustness._BLOCK", 5)
+    in_blocks, _ = survival(policy, task, forces, phases, SMALL, threads=1)
+    np.testing.assert_array_equal(in_blocks, survived)
     assert unpushed == serial(task, policy).survived
     across, along = np.array(task.push_plane)
     for f, force in enumerate(forces):
@@ -193,6 +201,28 @@ def test_an_episode_that_is_over_before_its_push_does_not_survive() -> None:
     assert len(found.surface.phases) == 3  # all of them are in the denominator
     low, high = wilson(0, 3 * 3)
     assert found.survival_100N_interval == (low, high)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing bounds address space")
+def test_all_pushes_of_a_rocket_take_less_than_4_gb() -> None:
+    """Of address space, where all 3072 side by side take 46 GB. It falls, but for too short a time
+    to leave the world, so that every push is played."""
+    program = (
+        "import resource\n"
+        "import numpy as np\n"
+        "from tsbench import tasks\n"
+        "from tsbench.evaluation.evaluate import evaluate\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (4_000_000_000, 4_000_000_000))\n"
+        "task = tasks.make('rocket_navigation', distance=5.0)\n"
+        "score = evaluate(lambda o: np.zeros((len(o), 2)), task, threads=1)\n"
+        "print(np.size(score.robustness.surface.survived), score.robustness.survival_100N)"
+    )
+    # A thread of BLAS takes address space too, and there is one for every core.
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment
+    )
+    assert done.stdout.split() == ["3072", "1.0"], done.stderr
 
 
 def test_the_rocket_is_pushed_as_fast() -> None:
