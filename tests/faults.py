@@ -26,7 +26,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -143,6 +143,16 @@ class Process:
     def until_iterations(self, count: int) -> bool:
         """Waits until it has reported that many; returns whether it came to that."""
         return self.until(lambda: iterations(self.folder) >= count)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Holds it still, so that nothing that is done to its files races with what it does."""
+        os.kill(self.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, self.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+        try:
+            yield
+        finally:
+            os.kill(self.pid, signal.SIGCONT)
 
     def wait(self) -> int:
         """The exit status, negative for a signal."""
@@ -297,9 +307,9 @@ class Campaign:
         """The place for checkpoints becomes read-only; later it can be written again."""
         folder, process = self.begin("read-only", 0.0)
         process.until_iterations(3)
-        os.kill(process.pid, signal.SIGSTOP)
-        with read_only(folder / "run" / "checkpoints") as (kind, says):
-            os.kill(process.pid, signal.SIGCONT)
+        with ExitStack() as stack:
+            with process.paused():
+                kind, says = stack.enter_context(read_only(folder / "run" / "checkpoints"))
             refused = process.wait() == 2 and says in process.line()
             refused &= Process(["run", "resume=run"], folder).wait() == 2
         self.ends(f"read-only ({kind})", folder, refused, process)
@@ -318,7 +328,8 @@ class Campaign:
         """The run's directory is removed under it."""
         folder, process = self.begin("vanished", 0.0)
         process.until_iterations(3)
-        shutil.rmtree(folder / "run")
+        with process.paused():
+            shutil.rmtree(folder / "run")
         refused = process.wait() == 2 and len(process.line().splitlines()) == 1
         self.check("vanished directory", refused, process.line())
 
@@ -348,10 +359,10 @@ class Campaign:
     def two_at_once(self) -> None:
         folder, process = self.begin("two at once", 0.0)
         process.until_iterations(3)
-        os.kill(process.pid, signal.SIGSTOP)
-        second = Process(["run", "resume=run"], folder / ".." / "second", lambda: os.chdir(folder))
-        refused = second.wait() == 2 and "another process" in second.line()
-        os.kill(process.pid, signal.SIGCONT)
+        with process.paused():
+            elsewhere = folder / ".." / "second"
+            second = Process(["run", "resume=run"], elsewhere, lambda: os.chdir(folder))
+            refused = second.wait() == 2 and "another process" in second.line()
         good = process.wait() == 0 and outcome(folder / "run") == self.uninterrupted(SUBJECT)[0]
         self.check("two runs into one directory", refused and good, second.line())
 
@@ -360,7 +371,8 @@ class Campaign:
         process.until_iterations(4)
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-        newest = sorted((folder / "run" / "checkpoints").iterdir())[-1]
+        # Not what the kill has left half written.
+        newest = sorted((folder / "run" / "checkpoints").glob("*.safetensors"))[-1]
         newest.write_bytes(newest.read_bytes()[:-1])
         self.ends("torn checkpoint", folder, True, process)
         said = "going back to the one before" in (folder / "run" / "log.txt").read_text()
