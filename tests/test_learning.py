@@ -12,7 +12,8 @@ import numpy as np
 from rich.console import Console
 
 from tsbench import config, run, tasks
-from tsbench.rl.ppo import Learner, PPOSettings
+from tsbench.rl.ppo import Learner
+from tsbench.rl.settings import PPOSettings
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.kinematic import Planning
 
