@@ -1,4 +1,4 @@
-"""What passes between a task and what steps it: states, starts and sensor readings."""
+"""What passes between a task and what steps it: states, courses, starts and sensor readings."""
 
 from __future__ import annotations
 
@@ -15,20 +15,14 @@ Rng = np.random.Generator
 
 
 @dataclass(frozen=True)
-class State:
-    """What a task knows at one time step; every field has the same leading batch axes.
-
-    Attributes:
-        time: seconds since the start of the episode, shape (...,).
-    """
-
-    time: Array
+class Batch:
+    """Arrays with the same leading batch axes."""
 
     def replace(self, **changes: Array) -> Self:
         return dataclasses.replace(self, **changes)
 
     def updated(self, rows: Array, other: Self) -> Self:
-        """This state with the states of `other` in place of `rows` (first batch axis)."""
+        """The same with the members of `other` in place of `rows` (first batch axis)."""
 
         def merge(field: dataclasses.Field[Any]) -> Array:
             old = getattr(self, field.name)
@@ -39,13 +33,35 @@ class State:
         return self.replace(**{f.name: merge(f) for f in dataclasses.fields(self)})
 
     def rows(self, rows: Array | slice) -> Self:
-        """The states of some members of the batch (first batch axis)."""
+        """Some members of the batch (first batch axis)."""
         return self.replace(
             **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)}
         )
 
 
+@dataclass(frozen=True)
+class State(Batch):
+    """What a task knows at one time step.
+
+    Attributes:
+        time: seconds since the start of the episode, shape (...,).
+    """
+
+    time: Array
+
+
 S = TypeVar("S", bound=State)
+
+
+@dataclass(frozen=True)
+class Course(Batch):
+    """What an episode has been through, as far as its last state does not tell.
+
+    Attributes:
+        violated: whether anything was violated on the way, shape (...,).
+    """
+
+    violated: Array
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from tsbench.arrays import Array, array_namespace, step_of
 from tsbench.drawing import Drawing
 from tsbench.errors import TsbenchError, unknown
 from tsbench.motion import Audit, Plan, ReferenceMotion
-from tsbench.state import Readings, Rng, S, Start
+from tsbench.state import Course, Readings, Rng, S, Start
 
 Vector = tuple[float, float, float]
 
@@ -83,32 +83,46 @@ class MDP(ABC, Generic[S]):
         shape (...,)."""
         return state.time < 0.0
 
+    def begun(self, state: S) -> Course:
+        """The course of episodes that begin in these states."""
+        return Course(violated=self.violated(state) & False)
+
+    def followed(self, course: Course, previous: S, state: S) -> Course:
+        """The course after the step from `previous` to `state`."""
+        return course.replace(violated=course.violated | self.violated(state))
+
     # Arriving: the one rule that scores and learners share. An episode that ends at its goal,
     # with nothing violated on the way, is credited for the steps that it spares: else hovering
     # just outside the goal would earn more than arriving.
 
-    def spared(self, state: S, violated: Array) -> Array:
+    def spared(self, state: S, course: Course) -> Array:
         """Steps that an episode which ends in this state does not need, since it has arrived;
         integers, zero unless it has, shape (...,).
 
         Args:
             state: that the episode ended in, for a reason other than its last step.
-            violated: whether anything was violated on the way, shape (...,).
+            course: that led there.
         """
         xp = array_namespace(state.time)
-        arrived = self.reached(state) & ~violated
+        arrived = self.reached(state) & ~course.violated
         return xp.where(arrived, self.horizon - step_of(state.time, self.timestep), 0)
 
-    def credit(self, spared: Array, discount: float = 1.0) -> Array:
-        """What spared steps earn: as much as perfect ones.
+    def quality(self, course: Course) -> Array:
+        """What a spared step is worth beside a perfect one, in [0, 1], shape (...,): how well the
+        episode did on its way what the task asks for beside arriving."""
+        return 1.0 - 0.0 * course.violated
+
+    def credit(self, spared: Array, quality: Array, discount: float = 1.0) -> Array:
+        """What spared steps earn.
 
         Args:
             spared: steps, floating-point numbers, shape (...,).
+            quality: what each is worth beside a perfect one, shape (...,).
             discount: gamma per time step; the first spared step is discounted once.
         """
-        if discount == 1.0:
-            return self.max_reward * spared
-        return self.max_reward * (discount * (1.0 - discount**spared) / (1.0 - discount))
+        if discount != 1.0:
+            spared = discount * (1.0 - discount**spared) / (1.0 - discount)
+        return self.max_reward * quality * spared
 
 
 class Plant(ABC, Generic[S]):
@@ -173,8 +187,8 @@ class Task(SimulatedTask[S], Plant[S]):
         return self
 
     @abstractmethod
-    def success(self, state: S) -> Array:
-        """Whether an episode that ends in `state`, without violation, counts as solved."""
+    def success(self, state: S, course: Course) -> Array:
+        """Whether an episode that ended in `state` after this course is solved, shape (...,)."""
 
     @abstractmethod
     def goal_distance(self, state: S) -> Array:

@@ -16,10 +16,12 @@ def best_return(task: Task[Any]) -> float:
     states = task.ideal()
     before, after = states.rows(slice(0, -1)), states.rows(slice(1, None))
     rewards = task.reward(before, np.zeros((task.horizon, task.action_size)), after)
-    violated = np.logical_or.accumulate(task.violated(after))
-    ends = task.terminal(after)
-    if not ends.any():
-        return float(rewards.sum())
-    last = int(np.argmax(ends))
-    spared = task.spared(after, violated)[last]
-    return float(rewards[: last + 1].sum()) + float(task.credit(spared))
+    course = task.begun(states.rows(slice(0, 1)))
+    for step in range(task.horizon):
+        previous, state = (one.rows(slice(step, step + 1)) for one in (before, after))
+        course = task.followed(course, previous, state)
+        if task.terminal(state)[0]:
+            spared = task.spared(state, course)
+            credit = task.credit(spared, task.quality(course))
+            return float(rewards[: step + 1].sum()) + float(credit[0])
+    return float(rewards.sum())

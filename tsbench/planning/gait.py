@@ -46,9 +46,9 @@ class Gait:
     def contacts(self, time: Array) -> Array:
         """Whether each foot is to be on the ground, shape (..., feet).
 
-        Touchdown and lift-off belong to the stance: the foot is on the ground at both.
+        A stance is half open: the foot is on the ground at touchdown, and at lift-off no longer.
         """
-        return self.phase(time, SLACK) <= self.duty + 2.0 * SLACK
+        return self.phase(time, SLACK) < self.duty
 
     def swung(
         self, plan_times: np.ndarray, planned: np.ndarray, times: np.ndarray, height: float

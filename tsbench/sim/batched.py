@@ -24,7 +24,7 @@ from tsbench.sim.change import Change
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
 from tsbench.sim.quiet import QUIET
-from tsbench.state import Readings, Rng, S, Start, State
+from tsbench.state import Course, Readings, Rng, S, Start, State
 from tsbench.task import MDP, SimulatedTask
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -209,6 +209,7 @@ class Transition(Generic[S]):
         ended: the rows of either kind of ending, shape (k,).
         final: the states that those episodes ended in, k of them.
         spared: steps that an episode which arrived at its goal did not need (`MDP.spared`).
+        quality: what each of those is worth beside a perfect one, in [0, 1].
     """
 
     observation: np.ndarray
@@ -218,6 +219,7 @@ class Transition(Generic[S]):
     ended: np.ndarray
     final: S
     spared: np.ndarray
+    quality: np.ndarray
 
 
 class BatchedEnvironment(Generic[S]):
@@ -227,7 +229,7 @@ class BatchedEnvironment(Generic[S]):
         state: of all episodes.
         steps: steps taken in each episode since its start, shape (n,). An episode that starts
             along a reference motion starts with the steps that lie before.
-        violated: whether anything was violated in each episode so far, shape (n,).
+        course: of all episodes so far.
         seconds: spent in `step` so far, wall-clock.
     """
 
@@ -238,14 +240,14 @@ class BatchedEnvironment(Generic[S]):
         self.rng = np.random.default_rng(seed)
         self.state: S
         self.steps = np.zeros(count, int)
-        self.violated = np.zeros(count, bool)
+        self.course: Course
         self.seconds = 0.0
 
     def reset(self) -> np.ndarray:
         """Starts all episodes; returns the observations, shape (n, observation_size)."""
         self.state = self.dynamics.begin(self.rng, np.arange(self.count))
         self.steps = step_of(self.state.time, self.mdp.timestep)
-        self.violated = np.zeros(self.count, bool)
+        self.course = self.mdp.begun(self.state)
         observation: np.ndarray = self.mdp.observation(self.state)
         return observation
 
@@ -268,30 +270,31 @@ class BatchedEnvironment(Generic[S]):
         diverged = self.dynamics.diverged
         if len(diverged):
             reward[diverged], terminal[diverged] = 0.0, True
-        self.violated |= self.mdp.violated(state)
-        self.violated[diverged] = True
+        self.course = self.mdp.followed(self.course, previous, state)
+        self.course.violated[diverged] = True
         truncated = (self.steps >= self.mdp.horizon) & ~terminal
         ended = np.flatnonzero(terminal | truncated)
         final = state.rows(ended)
-        spared = np.zeros(self.count, int)
+        spared, quality = np.zeros(self.count, int), np.zeros(self.count)
         if len(ended):
-            arrived = self.mdp.spared(final, self.violated[ended])
-            spared[ended] = np.where(terminal[ended], arrived, 0)
+            course = self.course.rows(ended)
+            spared[ended] = np.where(terminal[ended], self.mdp.spared(final, course), 0)
+            quality[ended] = self.mdp.quality(course)
             fresh = self.dynamics.begin(self.rng, ended)
             self.steps[ended] = step_of(fresh.time, self.mdp.timestep)
-            self.violated[ended] = False
+            self.course = self.course.updated(ended, self.mdp.begun(fresh))
             state = state.updated(ended, fresh)
         self.state = state
         observation = self.mdp.observation(state)
         self.seconds += perf_counter() - began
-        return Transition(observation, reward, terminal, truncated, ended, final, spared)
+        return Transition(observation, reward, terminal, truncated, ended, final, spared, quality)
 
     def snapshot(self) -> dict[str, Any]:
         """All that the next step depends on, but for the action: plain values and arrays."""
         return {
             "rng": self.rng.bit_generator.state,
             "steps": self.steps,
-            "violated": self.violated,
+            "course": vars(self.course),
             "state": vars(self.state),
             "dynamics": self.dynamics.snapshot(),
         }
@@ -300,7 +303,7 @@ class BatchedEnvironment(Generic[S]):
         """Goes on from where `snapshot` was taken; `reset` must have been called before."""
         self.rng.bit_generator.state = snapshot["rng"]
         self.steps = snapshot["steps"]
-        self.violated = snapshot["violated"]
+        self.course = self.course.replace(**snapshot["course"])
         self.state = self.state.replace(**snapshot["state"])
         self.dynamics.restore(snapshot["dynamics"])
 

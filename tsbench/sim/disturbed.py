@@ -10,11 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from tsbench.arrays import Array
 from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
 from tsbench.sim.push import Push, direction
 from tsbench.state import Rng, S
 from tsbench.task import SimulatedTask
+
+MOST_LATENCY = 100  # control steps; more is a mistake
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,8 @@ class Disturbances:
         mass: largest change of all masses, as a share, up or down; of each environment its own.
         friction: the same for friction.
         strength: the same for the strength of the motors.
+        latency: control steps at most by which actions come late; of each episode its own, all
+            numbers of steps equally likely. Actions of zero come before the first.
     """
 
     push: float = 0.0
@@ -41,12 +46,15 @@ class Disturbances:
     mass: float = 0.0
     friction: float = 0.0
     strength: float = 0.0
+    latency: int = 0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.push < math.inf:
             raise ValueError(f"push must not be negative, not {self.push}")
         if self.rise < 0:
             raise ValueError(f"rise must not be negative, not {self.rise}")
+        if not 0 <= self.latency <= MOST_LATENCY:
+            raise ValueError(f"latency must lie between 0 and {MOST_LATENCY}, not {self.latency}")
         if not 0.0 < self.duration <= self.interval < math.inf:
             raise ValueError("duration must be positive and at most the interval")
         for name in ("calm", "mass", "friction", "strength"):
@@ -57,8 +65,8 @@ class Disturbances:
 class DisturbedPhysics(Physics[S]):
     """Full physics under disturbances.
 
-    Every environment keeps its own physics for good, drawn from `seed`. An episode's pushes are
-    drawn when it begins, so that they depend on nothing that happens in it.
+    Every environment keeps its own physics for good, drawn from `seed`. An episode's pushes and its
+    latency are drawn when it begins, so that they depend on nothing that happens in it.
     """
 
     def __init__(
@@ -75,6 +83,10 @@ class DisturbedPhysics(Physics[S]):
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
         self._first = np.zeros(count)  # seconds into the episode
         self._forces = np.zeros((count, pushes, 3))
+        self._latency = np.zeros(count, int)  # of each episode
+        self._actions = np.zeros(
+            (count, disturbances.latency + 1, task.action_size)
+        )  # newest first
         rng = np.random.default_rng(seed)
         bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
         if any(bounds):
@@ -87,7 +99,20 @@ class DisturbedPhysics(Physics[S]):
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         if self.disturbances.push:
             self._draw(rng, rows)
+        if self.disturbances.latency:
+            self._latency[rows] = rng.integers(
+                0, self.disturbances.latency, len(rows), endpoint=True
+            )
+            self._actions[rows] = 0.0
         return super().begin(rng, rows)
+
+    def advance(self, state: S, action: Array, rows: np.ndarray | None = None) -> S:
+        if self.disturbances.latency:
+            at = np.arange(len(self._actions)) if rows is None else rows
+            self._actions[at, 1:] = self._actions[at, :-1]
+            self._actions[at, 0] = action
+            action = self._actions[at, self._latency[at]]
+        return super().advance(state, action, rows)
 
     def _draw(self, rng: Rng, rows: np.ndarray) -> None:
         shape = (len(rows), self._forces.shape[1])
@@ -102,11 +127,18 @@ class DisturbedPhysics(Physics[S]):
         return self.disturbances.push * (1.0 if steps >= rise else steps / rise)
 
     def snapshot(self) -> dict[str, Any]:
-        return {**super().snapshot(), "first": self._first, "forces": self._forces}
+        return {
+            **super().snapshot(),
+            "first": self._first,
+            "forces": self._forces,
+            "latency": self._latency,
+            "actions": self._actions,
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
         self._first, self._forces = snapshot["first"], snapshot["forces"]
+        self._latency, self._actions = snapshot["latency"], snapshot["actions"]
 
     def push_force(self, time: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
         """Of the push that is the latest by the end of the step."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from tsbench.arrays import step_of
 from tsbench.sim.batched import Dynamics, expect_finite
-from tsbench.state import S
+from tsbench.state import Course, S
 from tsbench.task import MDP
 
 PolicyFunction = Callable[[np.ndarray], np.ndarray]  # observations (n, o) -> actions (n, a)
@@ -25,8 +25,8 @@ class Episodes(Generic[S]):
         lengths: steps taken, shape (n,).
         limits: steps that could be taken, shape (n,): T, or less where an episode began late.
         spared: steps that the episode did not need, since it arrived at its goal, shape (n,).
-        violated: whether something spoiled it on the way, shape (n,). Its physics having diverged,
-            which ends it with a reward of zero for that step, does.
+        course: of each episode. Its physics having diverged, which ends it with a reward of zero
+            for that step, is a violation.
         diverged: whether that happened, shape (n,).
         cut: whether it ended for a reason other than its goal or its last step, shape (n,).
         credit: what the spared steps earn (`MDP.credit`), shape (n,).
@@ -41,7 +41,7 @@ class Episodes(Generic[S]):
     lengths: np.ndarray
     limits: np.ndarray
     spared: np.ndarray
-    violated: np.ndarray
+    course: Course
     diverged: np.ndarray
     cut: np.ndarray
     credit: np.ndarray
@@ -65,7 +65,8 @@ class Episodes(Generic[S]):
     @property
     def survived(self) -> np.ndarray:
         """Whether it went on unspoiled to its goal or its last step, shape (n,)."""
-        return ~self.violated & ~self.cut
+        survived: np.ndarray = ~self.course.violated & ~self.cut
+        return survived
 
 
 def play(
@@ -100,7 +101,8 @@ def play(
     begun = step_of(state.time, mdp.timestep)
     limits = mdp.horizon - begun
     longest = int(limits.max())
-    violated, diverged, cut = (np.zeros(count, bool) for _ in range(3))
+    diverged, cut = (np.zeros(count, bool) for _ in range(2))
+    course = mdp.begun(state)
     lengths, spared = np.zeros(count, int), np.zeros(count, int)
     rewards = np.zeros((longest, count))
     actions = np.zeros((longest, count, mdp.action_size))
@@ -121,9 +123,11 @@ def play(
         rewards[step, rows] = reward
         actions[step, rows] = action
         diverged[rows] = failed
-        violated[rows] |= mdp.violated(following) | failed
+        passed = mdp.followed(course.rows(rows), state, following)
+        passed.violated[failed] = True
+        course = course.updated(rows, passed)
         terminal, at_goal = mdp.terminal(following) | failed, mdp.reached(following)
-        spared[rows] = np.where(terminal, mdp.spared(following, violated[rows]), 0)
+        spared[rows] = np.where(terminal, mdp.spared(following, passed), 0)
         cut[rows] = terminal & ~at_goal
         going = ~terminal & (lengths[rows] < limits[rows])
         if record:
@@ -141,10 +145,10 @@ def play(
         lengths=lengths,
         limits=limits,
         spared=spared,
-        violated=violated,
+        course=course,
         diverged=diverged,
         cut=cut,
-        credit=mdp.credit(spared),
+        credit=mdp.credit(spared, mdp.quality(course)),
         final=final,
         states=np.stack(recorded) if record else None,
         actions=actions,

@@ -9,7 +9,7 @@ import numpy as np
 
 from tsbench.arrays import Array
 from tsbench.motion import Plan
-from tsbench.state import Rng, S
+from tsbench.state import Course, Rng, S
 from tsbench.task import MDP, Task, plannable
 
 
@@ -58,6 +58,15 @@ class Planning(MDP[S]):
 
     def violated(self, state: S) -> Array:
         return self.task.violated(state)
+
+    def begun(self, state: S) -> Course:
+        return self.task.begun(state)
+
+    def followed(self, course: Course, previous: S, state: S) -> Course:
+        return self.task.followed(course, previous, state)
+
+    def quality(self, course: Course) -> Array:
+        return self.task.quality(course)
 
     # Its dynamics, for BatchedEnvironment
 

@@ -21,7 +21,7 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
 from tsbench.sim.quiet import QUIET
-from tsbench.state import Readings, State
+from tsbench.state import Course, Readings, State
 from tsbench.task import MDP, SimulatedTask
 
 ROW = np.array([0])  # the batch of one that every state here is
@@ -41,8 +41,8 @@ class Adapter(control.Task):
         self.state: State
         self._previous: State
         self._action: Array
+        self.course: Course
         self._steps = 0
-        self._violated = False
 
     @abstractmethod
     def begin(self, physics: dm_mujoco.Physics) -> None:
@@ -51,7 +51,7 @@ class Adapter(control.Task):
     def initialize_episode(self, physics: dm_mujoco.Physics) -> None:
         self.begin(physics)
         self._steps = int(step_of(self.state.time, self.mdp.timestep)[0])
-        self._violated = False
+        self.course = self.mdp.begun(self.state)
 
     def before_step(self, action: np.ndarray, physics: dm_mujoco.Physics) -> None:
         self._previous = self.state
@@ -74,7 +74,7 @@ class Adapter(control.Task):
 
     def after_step(self, physics: dm_mujoco.Physics) -> None:
         self.follow(physics)
-        self._violated |= bool(self.mdp.violated(self.state)[0])
+        self.course = self.mdp.followed(self.course, self._previous, self.state)
 
     @abstractmethod
     def follow(self, physics: dm_mujoco.Physics) -> None:
@@ -83,7 +83,7 @@ class Adapter(control.Task):
     def spared(self) -> int:
         """Steps that the arrival which ended the episode spares (`MDP.spared`), else zero."""
         ended = bool(self.mdp.terminal(self.state)[0])
-        return int(self.mdp.spared(self.state, np.array([self._violated]))[0]) if ended else 0
+        return int(self.mdp.spared(self.state, self.course)[0]) if ended else 0
 
     def action_spec(self, physics: dm_mujoco.Physics) -> dm_env.specs.BoundedArray:
         return dm_env.specs.BoundedArray(
@@ -130,10 +130,13 @@ class PhysicsAdapter(Adapter):
             physics.data.xfrc_applied[body, :3] = force[0]
 
     def follow(self, physics: dm_mujoco.Physics) -> None:
-        if physics.diverged:
-            self._violated = True
-        else:
+        if not physics.diverged:
             self._read(physics, self.state.time + self.task.timestep, self._memory)
+
+    def after_step(self, physics: dm_mujoco.Physics) -> None:
+        super().after_step(physics)
+        if physics.diverged:
+            self.course = self.course.replace(violated=np.ones(1, bool))
 
     def get_reward(self, physics: dm_mujoco.Physics) -> float:
         return 0.0 if physics.diverged else super().get_reward(physics)

@@ -7,7 +7,7 @@ RL; joints of a leg in the order abduction, thigh, calf. Quaternions are (w, x, 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -24,7 +24,7 @@ from tsbench.planning.ik import FootPoses
 from tsbench.rotations import angle_between, multiply, to_heading, upward
 from tsbench.sim.model import compiled, load_spec
 from tsbench.sim.tracking import deepmimic_reward
-from tsbench.state import Readings, Rng, Start, State
+from tsbench.state import Course, Readings, Rng, Start, State
 from tsbench.task import Abstraction, Plannable, Tracker
 from tsbench.tasks import register
 
@@ -36,6 +36,7 @@ class Constants:
     """What decides a score, beside the gait, the goal and the MJCF."""
 
     control_timestep: float = constant(1 / 30, "s", "P", "between actions")
+    horizon: int = constant(180, "", "D", "control steps at the standard distance: 6 s")
     substeps: int = constant(20, "", "P", "physics steps in a control step: 600 Hz")
     nominal: tuple[float, ...] = constant((0.0, 0.67, -1.33) * 4, "rad", "D", "pose of action zero")
     residual: float = constant(0.75, "rad", "D", "joint targets off the nominal pose by action 1")
@@ -54,10 +55,9 @@ class Constants:
     swing_height: float = constant(0.10, "m", "P", "of a sole in swing")
     foot_radius: float = constant(0.0265, "m", "D", "of the sphere whose lowest point is the sole")
     fall_height: float = constant(0.32, "m", "P", "of the centre of mass; lower is a fall")
-    goal_tolerance: float = constant(0.05, "m", "D", "from the goal that count as there")
-    success_share: float = constant(
-        0.2, "", "D", "of the starting distance that may remain at the end"
-    )
+    goal_tolerance: float = constant(0.10, "m", "D", "from the goal that count as there")
+    sole_height: float = constant(0.01, "m", "D", "below which a sole counts as on the ground")
+    success_agreement: float = constant(0.8, "", "D", "footfall agreement of a solved episode")
     start_angle: float = constant(0.05, "rad", "D", "spread of perturbed starts, joints and base")
     start_speed: float = constant(0.1, "m/s", "D", "the same of the base's velocity")
     start_spin: float = constant(0.2, "rad/s", "D", "the same of angular velocities")
@@ -81,6 +81,7 @@ COM_DECAY = -5.0  # 1/m, k_com, which the paper leaves out (D)
 PLAN_TIMESTEP = 1 / 30
 PLAN_REACH = 0.15  # m, how far a planned foot may be ahead of or behind its hip (D)
 PLAN_SIGHT = 0.5  # m, beyond which the planner does not see how far the goal is (D)
+SLOWING = 0.15  # share of the way to the goal in a step, of a reference that goes on after its plan
 PLAN_HEIGHT = (0.40, 0.44)  # m, of a planned base: legs neither stretched nor folded (D)
 JOINT_SPEED = 12.8  # rad/s, what the motors can do (facts A1)
 
@@ -114,6 +115,26 @@ class LaikagoState(State):
     feet: Array
     com: Array
     filter: Array
+
+
+@dataclass(frozen=True)
+class LaikagoCourse(Course):
+    """How an episode's feet kept to the schedule.
+
+    Attributes:
+        nearest: smallest distance to the goal so far in metres, shape (...,).
+        stance: share of the feet that were to stand, summed over control steps, each weighted by
+            the metres that it gained, shape (...,).
+        stance_kept: of those, the feet whose soles were on the ground.
+        swing: the same of the feet that were to swing.
+        swing_kept: of those, the feet whose soles were above it.
+    """
+
+    nearest: Array
+    stance: Array
+    stance_kept: Array
+    swing: Array
+    swing_kept: Array
 
 
 @dataclass(frozen=True)
@@ -219,10 +240,69 @@ class Laikago(Plannable[LaikagoState]):
         strayed = self.goal_distance(state) > self.distance + C.goal_tolerance
         return self.reached(state) | strayed | self.fallen(state)
 
-    def success(self, state: LaikagoState) -> Array:
-        """Not fallen, and at most 20 % of the starting distance from the goal, at the end."""
-        near = self.goal_distance(state) <= C.success_share * self.distance
-        return near & ~self.fallen(state)
+    def begun(self, state: LaikagoState) -> LaikagoCourse:
+        still = 0.0 * state.time
+        return LaikagoCourse(
+            violated=self.violated(state) & False,
+            nearest=self.goal_distance(state),
+            stance=still,
+            stance_kept=still,
+            swing=still,
+            swing_kept=still,
+        )
+
+    def followed(
+        self, course: Course, previous: LaikagoState, state: LaikagoState
+    ) -> LaikagoCourse:
+        assert isinstance(course, LaikagoCourse)
+        xp = array_namespace(state.feet)
+        distance = self.goal_distance(state)
+        gained = xp.clip(course.nearest - distance, 0.0, None)
+        scheduled = self.gait.contacts(state.time)
+        down = state.feet[..., 2] - C.foot_radius < C.sole_height
+
+        def share(feet: Array) -> Array:
+            """Share of all feet, weighted by the ground that the step gained."""
+            return gained * xp.mean(xp.astype(feet, gained.dtype), axis=-1)
+
+        return LaikagoCourse(
+            violated=course.violated | self.violated(state),
+            nearest=xp.minimum(course.nearest, distance),
+            stance=course.stance + share(scheduled),
+            stance_kept=course.stance_kept + share(scheduled & down),
+            swing=course.swing + share(~scheduled),
+            swing_kept=course.swing_kept + share(~scheduled & ~down),
+        )
+
+    def footfall(self, course: Course) -> Array:
+        """Footfall agreement in [0, 1], shape (...,).
+
+        The share of stance samples with the sole below 1 cm, and of swing samples with it above,
+        over feet and control steps; each step is weighted by how much it lowered the smallest
+        distance to the goal so far, so that stepping on the spot does not whitewash a dash. The
+        agreement is the mean of both: 0.5 for feet that are dragged, or never put down. 0 where no
+        ground was gained in stance or in swing.
+        """
+        assert isinstance(course, LaikagoCourse)
+        xp = array_namespace(course.nearest)
+        tiny = 1e-9
+        stance = xp.where(course.stance > tiny, course.stance_kept, 0.0)
+        swing = xp.where(course.swing > tiny, course.swing_kept, 0.0)
+        return 0.5 * (
+            stance / xp.clip(course.stance, tiny, None) + swing / xp.clip(course.swing, tiny, None)
+        )
+
+    def quality(self, course: Course) -> Array:
+        """clip(2 x footfall agreement - 1, 0, 1): arriving with the right footfall beats stepping
+        in place just outside the goal, and no other gait is paid for arriving."""
+        agreement = self.footfall(course)
+        return array_namespace(agreement).clip(2.0 * agreement - 1.0, 0.0, 1.0)
+
+    def success(self, state: LaikagoState, course: Course) -> Array:
+        """The episode ended at its goal without a fall, and the footfall on the way agrees with
+        the schedule by at least 0.8."""
+        kept = self.footfall(course) >= C.success_agreement
+        return self.reached(state) & ~course.violated & kept
 
     # The physics
 
@@ -369,10 +449,13 @@ class Laikago(Plannable[LaikagoState]):
         """The plan at the control rate, its feet standing still in stance, swinging in half sines.
 
         No leg can rise 10 cm at once as the plan's feet do. A stance foot stands at the mean of
-        its planned positions; `audit` tells how far the plan moved it.
+        its planned positions; `audit` tells how far the plan moved it. A plan that ends before the
+        horizon goes on to the goal and steps in place there: a robot that misses the goal has
+        something to follow.
         """
-        steps = int(plan.times[-1] / self.timestep + 1e-9)
+        steps = self.horizon
         times = np.arange(steps + 1) * self.timestep
+        plan = self._continued(plan)
         base = PchipInterpolator(plan.times, plan.states[:, :3])(times)
         qpos, _ = poses(base, self._feet(plan, times))
         model = compiled("laikago")
@@ -397,6 +480,29 @@ class Laikago(Plannable[LaikagoState]):
             tracked={"feet": feet, "contacts": self.gait.contacts(times), "com": com},
         )
 
+    def _continued(self, plan: Plan) -> Plan:
+        """The plan, gone on with to the horizon: the base slows down towards the goal, and a foot
+        that comes down does so under its hip there."""
+        states = [plan.states[-1]]
+        goal = np.array([self.distance, 0.0, states[0][2]])
+        feet = np.concatenate([goal[:2] + HIPS, np.full((4, 1), C.foot_radius)], axis=1)
+        stood = np.ones(4, bool)  # since the plan's end
+        most = self.gait.base_speed * plan.timestep
+        for step in range(
+            len(plan.states), round(self.horizon * self.timestep / plan.timestep) + 1
+        ):
+            left = goal - states[-1][:3]
+            move = left * min(1.0, SLOWING, most / max(float(np.linalg.norm(left)), 1e-9))
+            stood &= self.gait.contacts(np.array((step - 1) * plan.timestep))
+            before = states[-1][3:].reshape(4, 3)
+            states.append(
+                np.concatenate(
+                    [states[-1][:3] + move, np.where(stood[:, None], before, feet).ravel()]
+                )
+            )
+        rewards = np.concatenate([plan.rewards, np.zeros(len(states) - 1)])
+        return replace(plan, states=np.concatenate([plan.states, states[1:]]), rewards=rewards)
+
     def _feet(self, plan: Plan, times: np.ndarray) -> np.ndarray:
         """Foot centres (n, 4, 3) at `times` after those of the plan."""
         planned = plan.states[:, 3:].reshape(-1, 4, 3)[..., :2]
@@ -412,10 +518,11 @@ class Laikago(Plannable[LaikagoState]):
         speed = float(np.abs(reference.qvel[:, 6:]).max())
         planned = plan.states[:, 3:].reshape(-1, 4, 3)
         feet, scheduled = reference.tracked["feet"], reference.tracked["contacts"]
-        standing = self._feet(plan, plan.times)
+        whole = self._continued(plan)
+        standing = self._feet(whole, plan.times)
         contacts = self.gait.contacts(plan.times)
         slip = np.linalg.norm((planned - standing)[..., :2], axis=-1).mean(axis=0, where=contacts)
-        residual = np.linalg.norm(feet - self._feet(plan, reference.times), axis=-1).max()
+        residual = np.linalg.norm(feet - self._feet(whole, reference.times), axis=-1).max()
         lift = (feet[..., 2] - C.foot_radius).max(axis=0)
         weight = scheduled[..., None].astype(float)
         support = (weight * feet[..., :2]).sum(1) / np.maximum(weight.sum(1), 1.0)
@@ -425,7 +532,7 @@ class Laikago(Plannable[LaikagoState]):
             (
                 AuditItem(
                     "distance of the plan's end from the goal",
-                    final, C.success_share * self.distance, "m",
+                    final, C.goal_tolerance, "m",
                 ),
                 AuditItem("joint angle beyond its limit", max(outside, 0.0), 1e-6, "rad"),
                 AuditItem("joint speed", speed, JOINT_SPEED, "rad/s"),
@@ -484,9 +591,12 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         move = self.gait.base_speed * PLAN_TIMESTEP * push
         swing = self.gait.leg_length * self.gait.foot_speed * PLAN_TIMESTEP
         ahead = self._ahead(state)
-        # A foot's displacement is the world's, so that an idle foot stands still. The base goes no
-        # further than the legs reach: a robot that does not step does not travel.
-        step = 2.0 * swing * step
+        # A foot's displacement is the world's, so that an idle foot stands still. A foot in stance
+        # is held: far from the goal the reward feels nothing, and plans that may slip there do.
+        # The base goes no further than the legs reach: a robot that does not step does not travel.
+        after = state.time + PLAN_TIMESTEP
+        held = self.gait.contacts(state.time) & self.gait.contacts(after)
+        step = xp.where(held, 0.0, 2.0 * swing * step)
         least = xp.max(ahead + xp.clip(step, None, 0.0), axis=-1)[..., None] - PLAN_REACH
         most = xp.min(ahead + xp.clip(step, 0.0, None), axis=-1)[..., None] + PLAN_REACH
         forward = xp.clip(move[..., :1], least, most)
@@ -633,19 +743,20 @@ def filter_memory(joints: np.ndarray) -> np.ndarray:
     return np.tile(joints - NOMINAL, 4)
 
 
-def _laikago(name: str, gait: Gait, distance: float) -> Laikago:
-    """The horizon is what the gait's top speed needs for the distance."""
+def _laikago(name: str, gait: Gait, distance: float, standard: float) -> Laikago:
+    """At the standard distance, 0.8 of what the gait's top speed goes in it, the horizon is 6 s; at
+    others it is in proportion."""
     if not gait.base_speed * PLAN_TIMESTEP <= distance < 1e3:
         raise ValueError("the distance must lie between one plan step and 1000 m")
-    horizon = round(distance / gait.base_speed / C.control_timestep)
+    horizon = round(distance / standard * C.horizon)
     return Laikago(name=name, gait=gait, distance=float(distance), horizon=horizon)
 
 
 @register("laikago_walk")
-def laikago_walk(distance: float = 1.584) -> Laikago:
-    return _laikago("laikago_walk", WALK, distance)
+def laikago_walk(distance: float = 1.25) -> Laikago:
+    return _laikago("laikago_walk", WALK, distance, standard=1.25)
 
 
 @register("laikago_trot")
-def laikago_trot(distance: float = 3.78) -> Laikago:
-    return _laikago("laikago_trot", TROT, distance)
+def laikago_trot(distance: float = 3.0) -> Laikago:
+    return _laikago("laikago_trot", TROT, distance, standard=3.0)

@@ -19,7 +19,7 @@ from tsbench.drawing import Drawing, Flame
 from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
 from tsbench.planning.path import Path
 from tsbench.sim.model import load_spec
-from tsbench.state import Readings, Rng, Start, State
+from tsbench.state import Course, Readings, Rng, Start, State
 from tsbench.task import Abstraction, Plannable, Tracker
 from tsbench.tasks import register
 
@@ -183,8 +183,8 @@ class Rocket(Plannable[RocketState]):
         """R, the sum of its terms (P)."""
         return sum(self.reward_terms(previous, action, state).values())
 
-    def terminal(self, state: RocketState) -> Array:
-        """Out of bounds (P)."""
+    def strayed(self, state: RocketState) -> Array:
+        """Out of bounds."""
         xp = array_namespace(state.position)
         low, high = (like(state.position, corner) for corner in self.bounds)
         return xp.any((state.position < low) | (state.position > high), axis=-1)
@@ -194,14 +194,21 @@ class Rocket(Plannable[RocketState]):
         xp = array_namespace(state.clearance)
         return xp.any(state.clearance <= 0.0, axis=-1)
 
-    def violated(self, state: RocketState) -> Array:
-        return self.collided(state)
+    def terminal(self, state: RocketState) -> Array:
+        """Out of bounds (P)."""
+        return self.strayed(state)
 
-    def success(self, state: RocketState) -> Array:
-        """At the end of the episode within 1 m of the goal and slower than 1 m/s."""
+    def violated(self, state: RocketState) -> Array:
+        """A collision, or out of bounds."""
+        return self.collided(state) | self.strayed(state)
+
+    def success(self, state: RocketState, course: Course) -> Array:
+        """At the end of the episode within 1 m of the goal and slower than 1 m/s; no collision and
+        never out of bounds on the way."""
         xp = array_namespace(state.position)
         speed = xp.linalg.vector_norm(state.velocity, axis=-1)
-        return (self.goal_distance(state) < C.success_distance) & (speed < C.success_speed)
+        there = (self.goal_distance(state) < C.success_distance) & (speed < C.success_speed)
+        return there & ~course.violated
 
     # The physics
 
