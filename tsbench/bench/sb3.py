@@ -122,7 +122,7 @@ def judge(task: Task[Any]) -> Judge:
 
     def score(policy: PolicyFunction) -> tuple[float, bool]:
         episode = play(task, Physics(task, 1), policy, 1, seed=0)
-        solved = task.success(episode.final) & ~episode.violated
+        solved = task.success(episode.final, episode.course)
         return float(episode.normalized[0]), bool(solved[0])
 
     return score

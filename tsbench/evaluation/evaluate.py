@@ -133,12 +133,12 @@ def _play(
 
 
 def _summary(task: Task[Any], episodes: Episodes[Any]) -> Summary:
-    solved = task.success(episodes.final) & ~episodes.violated
+    solved = task.success(episodes.final, episodes.course)
     return Summary(
         episodes=len(solved),
         normalized_reward=float(episodes.normalized.mean()),
         success=float(solved.mean()),
-        violations=float(episodes.violated.mean()),
+        violations=float(episodes.course.violated.mean()),
         steps=float(episodes.lengths.mean()),
         goal_distance=float(task.goal_distance(episodes.final).mean()),
     )

@@ -134,8 +134,8 @@ class Learner:
                 for _ in range(self.settings.rollout):
                     actions = rollout.act(observation)
                     observation, rewards, dones, extras = env.step(actions)
-                    self._count(rewards, dones, extras["spared"])
-                    rewards += self._credit(extras["spared"])
+                    self._count(rewards, dones, extras)
+                    rewards += self._credit(extras)
                     if not self.settings.bootstrap:
                         del extras["time_outs"]
                     rollout.add(rewards, dones, extras)
@@ -197,16 +197,20 @@ class Learner:
             rate = s.learning_rate * (s.final_learning_rate / s.learning_rate) ** share
             self._update.learning_rate = rate
 
-    def _credit(self, spared: torch.Tensor) -> torch.Tensor:
+    def _credit(self, extras: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """What the steps that an arrival spares are credited with, as scores have it, in rewards
         per step and discounted by actions."""
         s = self.settings
-        return self.environment.mdp.credit(spared / s.repeat, s.discount**s.repeat)
+        spared, quality = extras["spared"] / s.repeat, extras["quality"]
+        return self.environment.mdp.credit(spared, quality, s.discount**s.repeat)
 
-    def _count(self, rewards: torch.Tensor, dones: torch.Tensor, spared: torch.Tensor) -> None:
+    def _count(
+        self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, torch.Tensor]
+    ) -> None:
         repeat = self.settings.repeat  # an episode's last hold counts in full
         self._return += rewards.numpy() * repeat
-        self._return += self.environment.mdp.credit(spared.numpy())
+        credit = self.environment.mdp.credit(extras["spared"], extras["quality"])
+        self._return += credit.numpy()
         self._length += repeat
         ended = np.flatnonzero(dones.numpy())
         self._returns.extend(self._return[ended].tolist())

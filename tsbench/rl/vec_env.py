@@ -56,24 +56,25 @@ class TorchEnvironment(VecEnv):
         Of an episode that ends on the way the missing steps count as zero; the one that begins
         waits for its first action with one of zeros. Extras, each of shape (num_envs,):
         `time_outs`, whether an episode ended with its last step; `spared`, how many steps one that
-        ended at its goal did not need."""
+        ended at its goal did not need, and `quality`, what each of them is worth."""
         held = actions.numpy(force=True).astype("float64")
         transition = self.environment.step(held)
         reward = transition.reward
         terminal, time_outs = transition.terminal, transition.truncated
-        spared = transition.spared
+        spared, quality = transition.spared, transition.quality
         for _ in range(self.repeat - 1):
             over = terminal | time_outs
             held[over] = 0.0
             transition = self.environment.step(held)
             reward = reward + np.where(over, 0.0, transition.reward)
             spared = spared + np.where(over, 0, transition.spared)
+            quality = quality + np.where(over, 0.0, transition.quality)
             terminal = terminal | (transition.terminal & ~over)
             time_outs = time_outs | (transition.truncated & ~over)
         self._observation = self._tensors(transition.observation)
         rewards = self._floats(reward / self.repeat)
         dones = torch.from_numpy(terminal | time_outs).to(self.device, torch.long)
-        extras = {"time_outs": time_outs, "spared": spared}
+        extras = {"time_outs": time_outs, "spared": spared, "quality": quality}
         return (
             self._observation,
             rewards,

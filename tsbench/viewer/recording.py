@@ -137,8 +137,8 @@ def record_episode(task: Task[Any], policy: PolicyFunction, push: Push | None = 
         forces=forces[1:].reshape(length, -1, 6),
         states=joined(states),
         actions=episode.actions[:length, 0],
-        solved=bool(task.success(episode.final)[0] and not episode.violated[0]),
-        violated=bool(episode.violated[0]),
+        solved=bool(task.success(episode.final, episode.course)[0]),
+        violated=bool(episode.course.violated[0]),
     )
 
 
