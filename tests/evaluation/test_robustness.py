@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, cast
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +19,15 @@ from hypothesis import strategies as st
 
 from tsbench import tasks
 from tsbench.evaluation.evaluate import evaluate
-from tsbench.evaluation.protocol import SMOKE, V1, Condition, Protocol, perturbed_starts
+from tsbench.evaluation.protocol import (
+    PHYSICS,
+    PROTOCOLS,
+    SMOKE,
+    V1,
+    Condition,
+    Protocol,
+    perturbed_starts,
+)
 from tsbench.evaluation.robustness import (
     impulse_50,
     mass_scale,
@@ -134,7 +145,11 @@ def test_serial_equals_batched(name: str) -> None:
     for condition in (
         Condition("all at once", Change(mass=1.2, friction=0.5, strength=0.8)),
         Condition("late", delay=2),
+        Condition("half the time step", Change(refine=2)),
+        Condition("other contacts", Change(cone="elliptic", impratio=10.0)),
     ):
+        if name.startswith("rocket") and condition.change.cone:
+            continue  # it touches nothing
         changed = batched(task, policy, condition=condition)
         assert equal(changed, 0, serial(task, policy, condition=condition))
         assert changed.rewards.tolist() != batched(task, policy).rewards.tolist()
@@ -279,12 +294,28 @@ def test_wilson_by_hand() -> None:
 
 
 def test_v1_is_frozen() -> None:
-    """Whoever changes one of these makes a new protocol with a new name."""
+    """It is frozen from here on: whoever needs other numbers makes a new protocol with a new name,
+    and this hash stays."""
+    content = json.dumps(asdict(V1), sort_keys=True)
+    assert hashlib.sha256(content.encode()).hexdigest() == (
+        "051a75485c6739b3058fe7715287418d95bffaf9dc3a96d9f48b4c176cdf0678"
+    )
+
+
+def test_what_v1_asks() -> None:
+    """The same in numbers that people can read."""
     assert (V1.name, V1.ranked, V1.seed, V1.perturbed, V1.changed) == ("v1", True, 0, 100, 20)
     assert (V1.headings, V1.phases, V1.claim, V1.duration) == (16, 1, 100.0, 0.1)
     assert V1.forces == tuple(range(50, 601, 50))
+    assert V1.physics == Change()
+    *others, elliptic, half = V1.conditions
+    assert (elliptic.name, elliptic.change) == (
+        "elliptic cone", Change(cone="elliptic", impratio=10.0),
+    )  # fmt: skip
+    assert (half.name, half.change) == ("half the time step", Change(refine=2))
+    assert elliptic.delay == half.delay == 0
     levels = {c.name: (c.change.mass, c.change.friction, c.change.strength, c.delay)
-              for c in V1.conditions}  # fmt: skip
+              for c in others}  # fmt: skip
     assert levels == {
         "mass x 0.8": (0.8, 1.0, 1.0, 0),
         "mass x 1.2": (1.2, 1.0, 1.0, 0),
@@ -304,7 +335,7 @@ def test_phases_are_one_gait_cycle() -> None:
     assert len(rocket) == 16
     assert rocket[0] == 16
     assert rocket[-1] == 503  # the planner's flight takes 519 steps
-    assert tasks.make("laikago_trot", distance=0.1).push_steps == (2, 3, 4)
+    assert tasks.make("laikago_trot", distance=0.1).push_steps == (3, 4, 5)
 
 
 def test_common_random_numbers() -> None:
@@ -338,6 +369,62 @@ def test_changes_do_what_they_say() -> None:
     np.testing.assert_array_equal(model.geom_friction, 0.5 * before[0])
     np.testing.assert_array_equal(model.actuator_forcerange, 0.8 * before[1])
     assert model.body_subtreemass[0] == pytest.approx(25.433)
+
+
+def test_another_contact_model() -> None:
+    model = tasks.make("laikago_walk").spec().compile()
+    before = model.opt.timestep
+    Change(cone="elliptic", impratio=10.0, refine=4).apply(model)
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert model.opt.impratio == 10.0
+    assert model.opt.timestep == before / 4
+    Change(cone="pyramidal").apply(model)
+    assert (model.opt.cone, model.opt.impratio) == (mujoco.mjtCone.mjCONE_PYRAMIDAL, 10.0)
+
+
+def test_a_finer_time_step_takes_as_many_more() -> None:
+    """The control step stays, and the fall is nearer to the true one:
+    v(t) = -g m / d (1 - exp(-d t / m)), with 2.5 m/s^2, 5 kg and 2.5 N s/m."""
+    task = tasks.make("rocket_navigation")
+    errors = []
+    for refine in (1, 2, 4):
+        change = Change(refine=refine)
+        physics: Physics[Any] = Physics(task, 1, threads=1, change=change)
+        state = physics.begin(np.random.default_rng(0), np.arange(1))
+        for _ in range(50):
+            state = physics.advance(state, np.zeros((1, 2)))
+        assert state.time[0] == pytest.approx(1.0)
+        assert physics.substeps == 50 * refine
+        errors.append(abs(float(state.velocity[0, 1]) + 5.0 * (1.0 - math.exp(-0.5))))
+    assert errors[0] == pytest.approx(2.0 * errors[1], rel=0.05)  # first order
+    assert errors[1] == pytest.approx(2.0 * errors[2], rel=0.05)
+
+
+def test_changes_add_up() -> None:
+    first, second = Change(mass=0.8, refine=2, cone="elliptic"), Change(1.5, 0.5, 0.9, refine=3)
+    assert second.after(first) == Change(0.8 * 1.5, 0.5, 0.9, cone="elliptic", refine=6)
+    assert first.after(Change(cone="pyramidal", impratio=2.0)) == replace(first, impratio=2.0)
+    assert Change().after(first) == first == first.after(Change())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"cone": "round"}, "cone must be one of pyramidal, elliptic, not round"),
+        ({"impratio": 0.0}, "impratio must be positive"),
+        ({"refine": 0}, "refine must lie between 1 and 1000"),
+    ],
+)
+def test_changes_that_cannot_be(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Change(**wrong)
+
+
+def test_another_physics_is_never_ranked() -> None:
+    for name, change in PHYSICS.items():
+        other = V1.elsewhere(name)
+        assert other == replace(V1, name=f"v1 in {name}", ranked=False, physics=change)
+        assert other.name not in PROTOCOLS
 
 
 def test_an_early_end_counts_its_missing_steps() -> None:

@@ -1,13 +1,15 @@
 """Evaluation protocol v1: everything that a score depends on beside the policy and the task.
 
-It is frozen. Whatever would change a number here makes a new protocol with a new name. All
-policies meet the same starts, changes and pushes (common random numbers), and an episode that
-fails stays in every mean as the failure that it is.
+It is frozen, and a test holds its hash. Whatever would change a number here makes a new protocol
+with a new name. All policies meet the same starts, changes and pushes (common random numbers), and
+an episode that fails stays in every mean as the failure that it is.
 
 1. *Nominal*: one episode from the task's own start.
 2. *Perturbed*: 100 episodes from the task's distribution of starts (`Task.start`). Episode i
    takes its start from a generator seeded with (seed, i), so that it can be had alone.
-3. *Changes*: the first 20 of those starts in changed physics.
+3. *Changes*: the first 20 of those starts in changed physics: other masses, friction and motors,
+   actions that come late, and another contact model (an elliptic cone, half the time step): what
+   a policy does must not hang on the solver that it was trained in.
 4. *Pushes*: a horizontal force (for the rocket, one in its plane) on the body's centre of mass for
    0.1 s, at 16 headings and at every phase of the motion (`Task.push_steps`), in the nominal
    episode. The forces are those on a body of Laikago's mass; on another they are scaled by mass,
@@ -15,15 +17,16 @@ fails stays in every mean as the failure that it is.
    comes before the push is the same for all, so that it is played once and gone on from; what
    comes after is played to the end of the episode.
 
+*Solved*: what the task calls success (`Task.success`), judged over the whole episode.
 *Survived*: the episode went on to its last step or its goal without a violation. A fall, a
 collision, and leaving the world or straying beyond the start are failures, and so is an episode
-that is over before its push: nobody has seen it survive.
+that is over before its push: nobody has seen it survive. *Recovered*: survived and solved.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -68,6 +71,7 @@ class Protocol:
     tolerance: by which shares may differ on another kind of machine, and rewards as shares of the
         best motion's.
     impulse_tolerance: the same for impulses, as a share.
+    physics: what everything is played in; the changes of the conditions come on top.
     """
 
     name: str
@@ -84,12 +88,23 @@ class Protocol:
     logged: int = 10
     tolerance: float = 0.05
     impulse_tolerance: float = 0.1
+    physics: Change = field(default_factory=Change)
 
     def directions(self) -> np.ndarray:
         """The headings in radians, shape (headings,)."""
         return np.arange(self.headings) * (2.0 * math.pi / self.headings)
 
+    def elsewhere(self, physics: str) -> Protocol:
+        """The same asked in another physics, one of `PHYSICS`. No score by it can be ranked."""
+        name = f"{self.name} in {physics}"
+        return replace(self, name=name, ranked=False, physics=PHYSICS[physics])
 
+
+# Other ways to compute the same world, by name.
+PHYSICS = {
+    "elliptic": Change(cone="elliptic", impratio=10.0),
+    "half_step": Change(refine=2),
+}
 CONDITIONS = (
     Condition("mass x 0.8", Change(mass=0.8)),
     Condition("mass x 1.2", Change(mass=1.2)),
@@ -99,6 +114,8 @@ CONDITIONS = (
     Condition("motor strength x 1.2", Change(strength=1.2)),
     Condition("latency 1 control step", delay=1),
     Condition("latency 2 control steps", delay=2),
+    Condition("elliptic cone", PHYSICS["elliptic"]),
+    Condition("half the time step", PHYSICS["half_step"]),
 )
 
 V1 = Protocol(
@@ -119,7 +136,7 @@ SMOKE = Protocol(
     seed=0,
     perturbed=10,
     changed=1,
-    conditions=(CONDITIONS[0], CONDITIONS[-1]),
+    conditions=(CONDITIONS[0], CONDITIONS[7]),
     headings=4,
     phases=8,
     forces=(100, 400),

@@ -95,11 +95,12 @@ class Physics(Generic[S]):
         spec = self.plant.spec()
         spec.compiler.discardvisual = True  # 10 % faster, the same states to the last bit
         model = spec.compile()
-        if change is not None:
-            change.apply(model)
+        change = change or Change()
+        change.apply(model)
+        self._nstep = self.plant.substeps * change.refine  # in a control step
         # With memory of its own a simulation goes on from the sensors that were brought up to date,
         # which otherwise costs half a substep; among twenty substeps that does not pay.
-        self.batch = Batch(model, count, threads or 0, persistent=self.plant.substeps == 1)
+        self.batch = Batch(model, count, threads or 0, persistent=self._nstep == 1)
         self._sensors = sensor_slices(model)
         self._qpos = self.batch.bind("qpos")
         self._qvel = self.batch.bind("qvel")
@@ -131,9 +132,9 @@ class Physics(Generic[S]):
         began = perf_counter()
         with _computing():
             ids = None if rows is None else np.asarray(rows, np.int32)
-            self.batch.step(ids, nstep=self.plant.substeps, stage=_CURRENT)
+            self.batch.step(ids, nstep=self._nstep, stage=_CURRENT)
         self.seconds += perf_counter() - began
-        self.substeps += len(control) * self.plant.substeps
+        self.substeps += len(control) * self._nstep
         following = self._read(at, state.time + self.task.timestep, memory)
         warned = self.batch.warning[at, :, _NUMBER]
         self.warnings += warned.sum(axis=0)

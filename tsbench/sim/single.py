@@ -241,9 +241,11 @@ def environment(
         physics.plan_timestep = mdp.timestep
         return control.Environment(physics, PlanningAdapter(mdp, rng), n_sub_steps=1)
     model = mdp.plant.spec().compile()
-    if change is not None:
-        change.apply(model)
+    change = change or Change()
+    change.apply(model)
     physics = ExactPhysics.from_model(MjModel(model))
     return control.Environment(
-        physics, PhysicsAdapter(mdp, rng, perturbed, push), n_sub_steps=mdp.plant.substeps
+        physics,
+        PhysicsAdapter(mdp, rng, perturbed, push),
+        n_sub_steps=mdp.plant.substeps * change.refine,
     )
