@@ -301,20 +301,24 @@ def test_held_actions_are_counted_as_steps() -> None:
         (1.0, 1, 7.0, 7.0),
     ],
 )
-def test_an_arrival_is_worth_what_perfect_steps_would_be(
-    discount: float, repeat: int, spared: float, credit: float
+@pytest.mark.parametrize("quality", [1.0, 0.25])
+def test_an_arrival_is_worth_what_its_footfall_says(
+    discount: float, repeat: int, spared: float, credit: float, quality: float
 ) -> None:
+    """What perfect steps would be, times the quality."""
     near = Planning(tasks.make("laikago_walk", distance=0.3))
     taught = learner(replace(TINY, discount=discount, repeat=repeat), subject=near)
-    found = taught._credit(torch.tensor([spared]))
-    np.testing.assert_allclose(found, [near.max_reward * credit], rtol=1e-6)
+    arrived = {"spared": torch.tensor([spared]), "quality": torch.tensor([quality])}
+    expected = [near.max_reward * quality * credit]
+    np.testing.assert_allclose(taught._credit(arrived), expected, rtol=1e-6)
 
 
 def test_a_learner_is_told_of_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And its reports have the same return as a score: perfect steps after the goal."""
-    near = Planning(tasks.make("laikago_walk", distance=0.07))  # 2 cm to where the goal begins
+    """And its reports have the same return as a score: steps after the goal, at their worth."""
+    near = Planning(tasks.make("laikago_walk", distance=0.12))  # 2 cm to where the goal begins
+    monkeypatch.setattr(near, "quality", lambda course: np.full(len(course.violated), 0.25))
     taught = learner(replace(TINY, discount=0.9, bootstrap=False), subject=near)
-    told: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
+    told: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]] = []
     earned: list[torch.Tensor] = []
     step, add = taught._env.step, taught._rollout.add
 
@@ -325,19 +329,20 @@ def test_a_learner_is_told_of_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def added(rewards: torch.Tensor, dones: torch.Tensor, extras: Any) -> None:
         assert "time_outs" not in extras
-        told.append((rewards.clone(), dones, extras["spared"]))
+        told.append((rewards.clone(), dones, extras["spared"], extras["quality"]))
         add(rewards, dones, extras)
 
     monkeypatch.setattr(taught._env, "step", stepped)
     monkeypatch.setattr(taught._rollout, "add", added)
     taught.learn(1024)
     arrivals, returns, running = 0, [], np.zeros(8)
-    for own, (rewards, dones, spared) in zip(earned, told, strict=True):
-        credit = 0.9 * (1.0 - 0.9**spared) / 0.1
+    for own, (rewards, dones, spared, quality) in zip(earned, told, strict=True):
+        assert (quality[spared > 0] == 0.25).all()
+        credit = quality * 0.9 * (1.0 - 0.9**spared) / 0.1
         torch.testing.assert_close(rewards, own + credit)
         assert not (spared > 0)[dones == 0].any()
         arrivals += int((spared > 0).sum())
-        running += (own + near.max_reward * spared).numpy()
+        running += (own + near.max_reward * quality * spared).numpy()
         returns += running[dones == 1].tolist()
         running[dones == 1] = 0.0
     assert arrivals > 8

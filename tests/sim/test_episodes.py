@@ -101,7 +101,7 @@ def test_one_episode(
     episodes = walk([start], [speed])
     assert episodes.lengths.tolist() == [length]
     assert episodes.spared.tolist() == [10 - length if reached else 0]
-    assert episodes.violated.tolist() == [violated]
+    assert episodes.course.violated.tolist() == [violated]
     assert episodes.returns.tolist() == pytest.approx([total])
     assert episodes.normalized.tolist() == pytest.approx([total / 20.0])  # 2 x 10 steps
     assert episodes.final.x.tolist() == pytest.approx([start + length * speed])
@@ -114,7 +114,8 @@ def test_many_side_by_side() -> None:
     together = walk(starts, speeds, record=lambda state: state.x)
     for index, (start, speed) in enumerate(zip(starts, speeds, strict=True)):
         alone = walk([start], [speed])
-        for name in ("returns", "lengths", "spared", "violated", "normalized"):
+        assert alone.course.violated[0] == together.course.violated[index]
+        for name in ("returns", "lengths", "spared", "normalized"):
             assert getattr(together, name)[index] == getattr(alone, name)[0]
         np.testing.assert_array_equal(together.rewards[:, index], alone.rewards[:, 0])
         np.testing.assert_array_equal(together.actions[:, index], alone.actions[:, 0])

@@ -96,7 +96,7 @@ def test_a_diverged_episode_is_scored_as_a_failure(task: Task[Any]) -> None:
     wild = bursting(task, [1])
     episodes = play(task, Physics(wild, 3, threads=1), lambda o: np.zeros((len(o), 12)), 3, 0)
     assert episodes.diverged.tolist() == [False, True, False]
-    assert episodes.violated[1]
+    assert episodes.course.violated[1]
     assert not episodes.spared[1]
     assert episodes.lengths[1] == 1
     assert episodes.lengths[0] == episodes.lengths[2] > 10

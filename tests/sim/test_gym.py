@@ -67,9 +67,9 @@ def test_equal_to_the_dm_control_environment(
 
 def test_an_arrival_spares_steps() -> None:
     """The hand-made planner goes to the goal, and then, in the next episode, nobody moves."""
-    coated = GymEnvironment(tsbench.load("laikago_walk", "planning", distance=0.07))
+    coated = GymEnvironment(tsbench.load("laikago_walk", "planning", distance=0.12))
     batched = GymVectorEnvironment(
-        tsbench.load_batched("laikago_walk", "planning", count=COUNT, distance=0.07)
+        tsbench.load_batched("laikago_walk", "planning", count=COUNT, distance=0.12)
     )
     planning = coated.single.task.mdp
     coated.reset(seed=0)

@@ -26,7 +26,7 @@ from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.kinematic import Planning, naive_plan
 from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
-from tsbench.state import Readings, Rng, Start, State
+from tsbench.state import Course, Readings, Rng, Start, State
 from tsbench.task import Abstraction, Plannable, Task, Tracker
 from tsbench.viewer.recording import record_episode
 
@@ -77,7 +77,7 @@ class Cart(Task[CartState]):
     def terminal(self, state: CartState) -> Array:
         return state.x < -1.0
 
-    def success(self, state: CartState) -> Array:
+    def success(self, state: CartState, course: Course) -> Array:
         return self.goal_distance(state) < 0.1
 
     def goal_distance(self, state: CartState) -> Array:
