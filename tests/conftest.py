@@ -98,24 +98,34 @@ def _invented_record(name: str) -> Record:
     nominal = Summary(
         episodes=1,
         normalized_reward=0.01,
+        solved_reward=0.0,
         success=0.0,
         violations=0.25,
         steps=180.0,
         goal_distance=3.5,
+        measures=dict.fromkeys(task.measure_notes, 0.5),
+        solved=(0,),
     )
+    perturbed = replace(
+        nominal, episodes=100, steps=170.0, solved_reward=0.004, success=0.4,
+        solved=(1,) * 40 + (0,) * 60,
+    )  # fmt: skip
     score = Score(
         protocol=SMOKE.name,
+        solved_reward=0.004,
         normalized_reward=0.01,
-        optimality=0.125,
-        success=0.0,
+        success=0.4,
+        against_plan=0.125,
+        perturbed=perturbed,
         nominal=nominal,
-        perturbed=replace(nominal, episodes=100, steps=170.0),
         changes={"mass x 0.8": nominal},
         robustness=Robustness(
             survival_100N=0.25,
-            survival_100N_interval=(0.1, 0.5),
-            impulse_50=7.5,
-            impulse_50_is_lower_bound=False,
+            recovery_100N=0.125,
+            survival_impulse_50=7.5,
+            survival_impulse_50_is_lower_bound=False,
+            recovery_impulse_50=60.0,
+            recovery_impulse_50_is_lower_bound=True,
             mass_scale=1.0,
             push_duration_s=0.1,
             surface=Surface(
@@ -123,6 +133,7 @@ def _invented_record(name: str) -> Record:
                 headings_rad=(0.0, 1.5707963),
                 phases=(30, 34, 38, 42),
                 survived=(((1, 1, 1, 1), (1, 1, 1, 1)), ((1, 0, 1, 0), (0, 0, 0, 0))),
+                recovered=(((1, 1, 1, 0), (1, 1, 1, 0)), ((1, 0, 0, 0), (0, 0, 0, 0))),
             ),
         ),
         origin=Origin.here(task, SMOKE, lambda observation: observation),

@@ -99,7 +99,7 @@ def intact(
 def read_score(folder: Path) -> None:
     content = RunDirectory(folder).record()
     assert tables.run_title(content)
-    assert tables.summary(content.score)
+    assert tables.summary(content.score, tasks.make(content.task))
 
 
 def read_policy(folder: Path) -> None:

@@ -38,7 +38,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "viewer": {*CORE, "sim", "tasks", "evaluation", "record", "tables", "curves"},
     "config": {*CORE},
     "record": {*CORE, "tasks", "evaluation", "config"},
-    "tables": {"evaluation", "record"},
+    "tables": {"task", "evaluation", "record"},
     "workspace": {*CORE, "checkpoint", "events", "record", "tables"},
     "run": {
         *CORE, "sim", "tasks", "evaluation", "rl", "methods", "config", "record", "tables",

@@ -148,7 +148,9 @@ def test_the_table_tells_the_score_the_cost_and_where_to_look(shown: tuple[Path,
     for words in (
         "rocket_navigation, twostage, seed 3, budget smoke",
         "normalized_reward",
-        "optimality",
+        "SOLVED",
+        "against_plan",
+        "solved_reward",
         "success",
         "10 perturbed starts",
         "survival_100N",
@@ -210,10 +212,45 @@ def test_evaluate_says_when_a_score_is_not_what_the_policy_earns(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = json.loads((finished / "score.json").read_text())
-    content["score"]["normalized_reward"] = 0.99
+    content["score"]["nominal"]["normalized_reward"] = 0.99
     (finished / "score.json").write_text(json.dumps(content))
     assert cli.main(["evaluate", "one"]) == 1
     assert "one/score.json: compared bit for bit: DIFFERENT" in capsys.readouterr().out
+    content["score"]["solved_reward"] = 0.99  # a headline that its own summary belies
+    (finished / "score.json").write_text(json.dumps(content))
+    assert cli.main(["evaluate", "one"]) == 2
+    assert "solved_reward must be that of the perturbed starts" in capsys.readouterr().err
+
+
+def test_another_physics_is_played_beside_and_never_kept(
+    finished: Path, quick: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", "one", "--physics", "half_step", "--json", "two.json"]
+    assert cli.main(words) == 0
+    shown = capsys.readouterr().out
+    assert "verdicts that flip in physics half_step" in shown
+    assert "compared bit for bit: equal" in shown  # the certified score
+    content = json.loads(Path("two.json").read_text())
+    score = plain(RunDirectory(finished).record().score.as_dict())
+    assert {name: content[name] for name in score} == score
+    other = content["physics"]["score"]
+    assert other["protocol"] == "smoke in half_step"
+    assert other["origin"]["protocol"]["ranked"] is False
+    assert other["normalized_reward"] != content["normalized_reward"]
+    counts = {one["verdict"]: one["verdicts"] for one in content["physics"]["flips"]}
+    assert counts == {
+        "solved, task's own start": 1,
+        "solved, perturbed starts": 10,
+        "solved, changed physics": 2,
+        "survived, pushes": 2 * 4 * 2,
+        "recovered, pushes": 2 * 4 * 2,
+    }
+    assert cli.main(["evaluate", "one", "--physics", "round"]) == 2
+    assert "unknown physics 'round'; allowed: elliptic, half_step" in capsys.readouterr().err
+    keep = ["evaluate", "one", "--protocol", quick, "--physics", "elliptic", "--keep", "board"]
+    assert cli.main(keep) == 2
+    assert "--keep keeps certified scores: leave out --physics" in capsys.readouterr().err
+    assert not Path("board").exists()
 
 
 def test_evaluate_replays_where_the_machine_differs(
@@ -357,7 +394,7 @@ def test_a_score_that_does_not_repeat_is_no_entry(
     finished: Path, quick: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["evaluate", "one", "--protocol", quick, "--keep", "good"]) == 0
-    other_score(Path("good"), "score", "normalized_reward", value=0.99)
+    other_score(Path("good"), "score", "nominal", "normalized_reward", value=0.99)
     words = ["evaluate", "good", "--keep", "bad", "--json", "figures.json"]
     assert cli.main(words) == 1
     assert "not kept: the score is not what it was" in capsys.readouterr().out

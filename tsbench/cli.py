@@ -244,6 +244,8 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="NAME",
         help="v1 or smoke, which takes seconds (as the run was scored, else v1)",
     )
+    help_physics = "elliptic or half_step: play it there too, and count the verdicts that flip"
+    parser.add_argument("--physics", metavar="NAME", help=help_physics)
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
     help_keep = "copy a finished run and this score into a new directory, as leaderboards/ has it"
@@ -251,7 +253,8 @@ def _evaluate(words: Sequence[str]) -> int:
     options = parser.parse_args(words)
     from tsbench import record, tables, tasks
     from tsbench.evaluation.evaluate import evaluate
-    from tsbench.evaluation.protocol import PROTOCOLS, V1
+    from tsbench.evaluation.flips import flips
+    from tsbench.evaluation.protocol import PHYSICS, PROTOCOLS, V1
     from tsbench.evaluation.replay import compare
     from tsbench.files import write_json
 
@@ -266,12 +269,16 @@ def _evaluate(words: Sequence[str]) -> int:
     log = run.actions() if kept else None
     if options.keep is not None:
         record.check_keep(run, options.keep, protocol)
+        if options.physics is not None:
+            parser.error("--keep keeps certified scores: leave out --physics")
+    if options.physics is not None and options.physics not in PHYSICS:
+        raise unknown("physics", options.physics, PHYSICS)
     console, standard = Console(), tasks.standard(task)
     with tables.progress(console, "evaluate") as progress:
         score = evaluate(
             policy, task, protocol=protocol, threads=options.threads, progress=progress
         )
-    console.print(tables.score_table(f"{task.name}: {options.policy}", score))
+    console.print(tables.score_table(f"{task.name}: {options.policy}", score, task))
     tables.show_rank(console, standard, score)
     shown: dict[str, Any] = {**score.as_dict(), "standard": standard}
     agrees = None
@@ -281,6 +288,24 @@ def _evaluate(words: Sequence[str]) -> int:
         shown = record.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
         line = f" {run.score_file}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if options.physics is not None:
+        with tables.progress(console, options.physics) as progress:
+            other = evaluate(
+                policy,
+                task,
+                protocol=protocol.elsewhere(options.physics),
+                threads=options.threads,
+                progress=progress,
+            )
+        flipped = flips(score, other)
+        console.print(tables.flips_table(options.physics, flipped))
+        console.print(
+            f" solved_reward {tables.number(other.solved_reward)} in physics {options.physics}, "
+            f"{tables.number(score.solved_reward)} certified; the first is never ranked or kept",
+            highlight=False,
+            soft_wrap=True,
+        )
+        shown |= {"physics": {"score": other.as_dict(), "flips": [vars(one) for one in flipped]}}
     write_json(options.json, shown)
     if agrees is False:
         if options.keep is not None:

@@ -172,7 +172,7 @@ def _work(
         workspace.note(line)
         record = _train(config, problem, workspace, console)
         write_json(run.score_file, record.as_dict())  # last: it says that the run is finished
-    tables.show_run(console, record)
+    tables.show_run(console, record, problem.task)
     shutil.rmtree(run.checkpoints, ignore_errors=True)
     return record.score
 

@@ -38,6 +38,15 @@ class Batch:
             **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)}
         )
 
+    @classmethod
+    def joined(cls, batches: Sequence[Self]) -> Self:
+        """All members, one batch after the other."""
+        names = [field.name for field in dataclasses.fields(batches[0])]
+        xp = array_namespace(getattr(batches[0], names[0]))
+        return batches[0].replace(
+            **{name: xp.concat([getattr(batch, name) for batch in batches]) for name in names}
+        )
+
 
 @dataclass(frozen=True)
 class State(Batch):

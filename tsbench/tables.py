@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,8 +13,19 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
+from tsbench.evaluation.flips import Flips
+from tsbench.evaluation.references import beside
 from tsbench.evaluation.score import Score, Summary
 from tsbench.record import Record, RunDirectory
+from tsbench.task import Task
+
+HEADLINES = ("solved_reward", "normalized_reward", "against_plan")
+FIGURES = {  # what each says, in words
+    "solved_reward": "the reward as a share of the largest possible, 0 where not solved",
+    "normalized_reward": "the same, solved or not",
+    "against_plan": "the reward over that of the best plan; a policy may pass 1",
+    "success": "share of the episodes that were solved",
+}
 
 
 def duration(seconds: float) -> str:
@@ -42,42 +53,95 @@ def progress(console: Console, what: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: bar.update(row, completed=share)
 
 
-def score_table(title: str, score: Score) -> Table:
-    """A score: the task's own start beside the perturbed ones, changed physics, and pushes."""
-    nominal, perturbed = score.nominal, score.perturbed
-    table = Table(title=escape(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+def score_table(title: str, score: Score, task: Task[Any]) -> Table:
+    """A score: perturbed starts beside the task's own, changed physics, and pushes."""
+    perturbed = score.perturbed
+    table = Table(
+        title=escape(title),
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        caption="\n".join(f"{name}: {FIGURES[name]}" for name in HEADLINES),
+        caption_justify="left",
+    )
     table.add_column(f"protocol {score.protocol}")
-    table.add_column("task's own start", justify="right")
     table.add_column(f"{perturbed.episodes} perturbed starts", justify="right")
-    table.add_row(
-        "normalized_reward",
-        number(score.normalized_reward),
-        number(perturbed.normalized_reward),
-    )
-    table.add_row("optimality", number(score.optimality))
-    for name in ("success", "violations", "steps", "goal_distance"):
-        table.add_row(name, number(getattr(nominal, name)), number(getattr(perturbed, name)))
+    table.add_column("task's own start", justify="right")
+    table.add_row(verdict(perturbed), style="bold")
+    for label, value, own in episode_rows(score, task):
+        table.add_row(label, value, own)
     table.add_section()
-    table.add_row("changed physics", "normalized_reward", "success", style="bold")
+    table.add_row("changed physics", "solved", "normalized_reward", style="bold")
     for name, change in score.changes.items():
-        table.add_row(name, number(change.normalized_reward), number(change.success))
-    robustness = score.robustness
-    low, high = robustness.survival_100N_interval
+        solved = f"{counts(change)[0]} of {change.episodes}"
+        table.add_row(name, solved, number(change.normalized_reward))
     table.add_section()
-    table.add_row("pushes", style="bold")
-    table.add_row(
-        "survival_100N", number(robustness.survival_100N), f"95 %: {low:.3f} to {high:.3f}"
-    )
-    if robustness.mass_scale != 1.0:
-        table.add_row("  100 N scaled by mass", number(claim_force(score)), "N")
-    bound = "at least " if robustness.impulse_50_is_lower_bound else ""
-    table.add_row("impulse_50", f"{bound}{number(robustness.impulse_50)}", "N s")
+    table.add_row("pushes", "survived", "and solved", style="bold")
+    for label, survived, recovered in _push_rows(score):
+        table.add_row(label, survived, recovered)
     return table
 
 
-def show_run(console: Console, record: Record) -> None:
+def verdict(summary: Summary) -> str:
+    """In capitals: how many episodes were solved."""
+    return f"SOLVED {counts(summary)[0]} of {summary.episodes}"
+
+
+def episode_rows(score: Score, task: Task[Any]) -> Iterator[tuple[str, str, str]]:
+    """Labels, and values from perturbed starts and from the task's own."""
+    own, other = score.nominal, score.perturbed
+    yield "solved_reward", number(score.solved_reward), number(own.solved_reward)
+    yield "normalized_reward", number(score.normalized_reward), number(own.normalized_reward)
+    yield "against_plan", number(score.against_plan), ""
+    yield "success", number(other.success), number(own.success)
+    for name, value in other.measures.items():
+        yield name, number(value), number(own.measures[name])
+    yield f"spoiled by {task.mishap}", number(other.violations), number(own.violations)
+    yield "steps", number(other.steps), number(own.steps)
+    yield "distance at the end, m", number(other.goal_distance), number(own.goal_distance)
+
+
+def _push_rows(score: Score) -> Iterator[tuple[str, str, str]]:
+    """Labels, and values of survival and of recovery."""
+    robustness = score.robustness
+    yield (
+        f"of {claim_force(score):.3g} N (survival_100N, recovery_100N)",
+        f"{robustness.survival_100N:.1%}",
+        f"{robustness.recovery_100N:.1%}",
+    )
+    for name, row in beside(score).items():
+        share, solved = row["survival_100N"], row["recovery_100N"]
+        yield f"  by the policy {name}", f"{share:.1%}", f"{solved:.1%}"
+    yield "withstood by half (impulse_50)", *_impulses(score)
+
+
+def _impulses(score: Score) -> tuple[str, str]:
+    """The impulses that half of the pushes survive and recover from, in words."""
+    robustness = score.robustness
+    return (
+        _impulse(robustness.survival_impulse_50, robustness.survival_impulse_50_is_lower_bound),
+        _impulse(robustness.recovery_impulse_50, robustness.recovery_impulse_50_is_lower_bound),
+    )
+
+
+def _impulse(value: float, is_lower_bound: bool) -> str:
+    return f"{'over ' if is_lower_bound else ''}{number(value)} N s"
+
+
+def flips_table(physics: str, found: Sequence[Flips]) -> Table:
+    """How many verdicts are others in another physics."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column(f"verdicts that flip in physics {physics}")
+    table.add_column("flipped", justify="right")
+    table.add_column("share", justify="right")
+    for one in found:
+        table.add_row(one.verdict, f"{one.flipped} of {one.verdicts}", f"{one.share:.1%}")
+    return table
+
+
+def show_run(console: Console, record: Record, task: Task[Any]) -> None:
     """Prints what ends a run: its score and what each stage cost."""
-    table = score_table(run_title(record), record.score)
+    table = score_table(run_title(record), record.score, task)
     table.add_section()
     table.add_row("stage", "steps", "time", style="bold")
     for stage in record.stages:
@@ -108,15 +172,17 @@ def run_title(record: Record) -> str:
     return f"{record.task}, {record.method}, seed {record.seed}, budget {record.budget}"
 
 
-def summary(score: Score) -> list[tuple[str, str]]:
+def summary(score: Score, task: Task[Any]) -> list[tuple[str, str]]:
     """Labels and values of a score in short, in words that need no explanation."""
     perturbed = score.perturbed
     solved, spoiled = counts(perturbed)
     return [
-        ("of the largest possible reward", f"{score.normalized_reward:.1%}"),
-        ("of the best motion at the planner's speed", f"{score.optimality:.1%}"),
         ("solved from other starts", f"{solved} of {perturbed.episodes}"),
-        ("falls and collisions there", f"{spoiled} of {perturbed.episodes}"),
+        *((name, number(value)) for name, value in perturbed.measures.items()),
+        (f"spoiled by {task.mishap}", f"{spoiled} of {perturbed.episodes}"),
+        ("share of the largest possible reward", f"{score.normalized_reward:.1%}"),
+        ("the same, only where it was solved", f"{score.solved_reward:.1%}"),
+        ("reward over that of the best plan", number(score.against_plan)),
         *pushes(score),
     ]
 
@@ -124,10 +190,17 @@ def summary(score: Score) -> list[tuple[str, str]]:
 def pushes(score: Score) -> list[tuple[str, str]]:
     """Labels and values of its robustness in short."""
     robustness = score.robustness
-    bound = "over " if robustness.impulse_50_is_lower_bound else ""
+    survival, recovery = _impulses(score)
+    force = f"{claim_force(score):.3g} N"
     return [
-        (f"pushes of {claim_force(score):.3g} N survived", f"{robustness.survival_100N:.0%}"),
-        ("impulse that half survive", f"{bound}{number(robustness.impulse_50)} N s"),
+        (f"pushes of {force} survived", f"{robustness.survival_100N:.0%}"),
+        *(
+            (f"  the same by the policy {name}", f"{row['survival_100N']:.0%}")
+            for name, row in beside(score).items()
+        ),
+        (f"pushes of {force} survived and solved", f"{robustness.recovery_100N:.0%}"),
+        ("impulse that half of the pushes survive", survival),
+        ("impulse at which half survive and solve", recovery),
     ]
 
 

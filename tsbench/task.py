@@ -180,15 +180,53 @@ class SimulatedTask(MDP[S]):
 
 
 class Task(SimulatedTask[S], Plant[S]):
-    """A task that can be scored. It is its own plant."""
+    """A task that can be scored. It is its own plant.
+
+    Attributes:
+        measure_notes: what each of `measures` says, in words, by its name.
+    """
+
+    measure_notes: Mapping[str, str] = MappingProxyType({})
 
     @property
     def plant(self) -> Plant[S]:
         return self
 
+    @property
+    def mishap(self) -> str:
+        """What a violation is, in words that follow "without": "a fall"."""
+        return "a violation"
+
     @abstractmethod
     def success(self, state: S, course: Course) -> Array:
         """Whether an episode that ended in `state` after this course is solved, shape (...,)."""
+
+    # Measures: what an episode did, in figures that mean something by themselves.
+
+    def measured(self, previous: S, action: Array | None, state: S) -> dict[str, Array]:
+        """What a step adds to sums over the episode that `measures` needs, by name, each of shape
+        (...,); by default nothing. `action` is None where nothing acted, as along a plan: what
+        needs one is then left out."""
+        return {}
+
+    def measures(
+        self, first: S, last: S, course: Course, sums: Mapping[str, Array], steps: Array
+    ) -> dict[str, Array]:
+        """What there is to say of finished episodes beside their reward: figures by name, with the
+        unit in the name, what matters most first; not a number where an episode has none. By
+        default there are none.
+
+        Args:
+            first: the state that the episode began in.
+            last: the state that it ended in.
+            course: that led there.
+            sums: of what its steps `measured`.
+            steps: that it took, shape (...,).
+
+        Returns:
+            Each of shape (...,).
+        """
+        return {}
 
     @abstractmethod
     def goal_distance(self, state: S) -> Array:

@@ -44,10 +44,11 @@ def test_an_entry_holds_together(entry: Path) -> None:
     assert run.config_file.read_text().startswith("# tsbench run ")
     for motion in (run.plan(task), run.reference(task)):
         assert motion is None or motion.task == task.name
-    assert score.success == 1.0
-    assert score.robustness.survival_100N == 1.0  # the paper's claim
+    assert score.success >= 0.95
+    assert score.robustness.survival_100N >= 0.99  # the paper's claim
+    assert score.robustness.recovery_100N >= 0.95
     if task.pushed == "trunk":
-        assert score.robustness.impulse_50 >= 40.0
+        assert score.robustness.survival_impulse_50 >= 35.0
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
@@ -67,7 +68,7 @@ def test_an_entry_repeats(entry: Path) -> None:
         assert replay(task, score, log)
     if (now.packages, now.machine) == (then.packages, then.machine):
         assert again.nominal == score.nominal
-    assert again.optimality == pytest.approx(score.optimality, abs=then.protocol.tolerance)
+    assert again.against_plan == pytest.approx(score.against_plan, abs=0.1)  # of ten starts
     assert compare(score, again, task, log).kind == "none"  # other protocols
 
 
@@ -77,3 +78,4 @@ def test_the_surface_fits_its_summary(entry: Path) -> None:
     surface = robustness.surface
     at_claim = np.isclose(surface.forces_N, 100.0 * robustness.mass_scale)
     assert np.array(surface.survived)[at_claim].mean() == robustness.survival_100N
+    assert np.array(surface.recovered)[at_claim].mean() == robustness.recovery_100N

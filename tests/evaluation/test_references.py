@@ -10,8 +10,9 @@ import pytest
 from tsbench import tasks
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.oracle import best_return
+from tsbench.evaluation.origin import constants_hash
 from tsbench.evaluation.protocol import V1
-from tsbench.evaluation.references import POLICIES, random, stored
+from tsbench.evaluation.references import POLICIES, beside, random, stored
 
 
 @pytest.mark.parametrize("name", tasks.names())
@@ -21,10 +22,12 @@ def test_the_oracle_is_remade(name: str) -> None:
     assert content["protocol"] == V1.name
     assert content["best_return"] == pytest.approx(best_return(task), rel=1e-12)
     oracle = content["rows"]["oracle"]
+    assert content["constants"] == constants_hash(task)
+    assert oracle["solved_reward"] == oracle["normalized_reward"]
     assert oracle["normalized_reward"] * task.max_reward * task.horizon == pytest.approx(
         content["best_return"]
     )
-    assert oracle["optimality"] == 1.0
+    assert oracle["against_plan"] == 1.0
 
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))
@@ -32,14 +35,31 @@ def test_the_oracle_is_remade(name: str) -> None:
 def test_the_reference_policies_are_remade(name: str, policy: str) -> None:
     """With those pushes alone between which half of them are survived."""
     task, row = tasks.make(name), stored(name)["rows"][policy]
-    few = replace(V1, conditions=(), phases=8, forces=(100.0, 150.0))
+    few = replace(V1, conditions=(), phases=8, forces=(100.0, 150.0, 200.0))
     score = evaluate(POLICIES[policy](task), task, protocol=few, threads=1)
+    assert score.solved_reward == row["solved_reward"] == 0.0
     assert score.normalized_reward == pytest.approx(row["normalized_reward"], rel=1e-9)
-    assert score.optimality == pytest.approx(row["optimality"], rel=1e-9)
-    assert score.success == row["success"]
-    assert score.perturbed.success == row["perturbed_success"]
-    assert score.robustness.survival_100N == row["survival_100N"]
-    assert score.robustness.impulse_50 == pytest.approx(row["impulse_50"], rel=1e-9)
+    assert score.against_plan == pytest.approx(row["against_plan"], rel=1e-9)
+    assert score.success == row["success"] == 0.0
+    robustness = score.robustness
+    assert robustness.survival_100N == row["survival_100N"]
+    assert robustness.recovery_100N == row["recovery_100N"] == 0.0
+    assert robustness.survival_impulse_50 == pytest.approx(row["survival_impulse_50"], rel=1e-9)
+    assert robustness.recovery_impulse_50 == row["recovery_impulse_50"] == 0.0
+
+
+def test_rows_stand_beside_scores_of_the_same_thing_only() -> None:
+    task = tasks.make("laikago_walk")
+    few = replace(V1, perturbed=1, conditions=(), phases=24, forces=(100.0,), headings=1)
+    score = evaluate(POLICIES["zero"](task), task, protocol=few, threads=1)
+    assert set(beside(score)) == {"zero", "random"}
+    assert (
+        beside(score)["zero"]["survival_100N"] == stored(task.name)["rows"]["zero"]["survival_100N"]
+    )
+    assert beside(replace(score, protocol="smoke")) == {}
+    origin = score.origin
+    for other in (replace(origin, constants="0"), replace(origin, task="another")):
+        assert beside(replace(score, origin=other)) == {}
 
 
 def test_the_random_policy_is_a_function() -> None:

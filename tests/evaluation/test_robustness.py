@@ -31,9 +31,8 @@ from tsbench.evaluation.protocol import (
 from tsbench.evaluation.robustness import (
     impulse_50,
     mass_scale,
+    pushed,
     robustness,
-    survival,
-    wilson,
 )
 from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
@@ -54,11 +53,13 @@ class Serial:
         rewards: of its steps.
         final: its last state.
         survived: by the protocol's words.
+        recovered: the same.
     """
 
     rewards: list[float]
     final: State
     survived: bool
+    recovered: bool
 
 
 def serial(
@@ -87,7 +88,9 @@ def serial(
         rewards.append(float(time_step.reward))
         violated |= bool(task.violated(adapter.state)[0])
     ended_well = time_step.discount == 1.0 or bool(task.reached(adapter.state)[0])
-    return Serial(rewards, adapter.state, ended_well and not violated)
+    survived = ended_well and not violated
+    solved = bool(task.success(adapter.state, adapter.course)[0])
+    return Serial(rewards, adapter.state, survived, survived and solved)
 
 
 def batched(
@@ -178,19 +181,23 @@ def test_a_push_played_from_its_moment_is_the_whole_episode(
     forces = np.array(SMALL.forces) * mass_scale(task)
     phases = task.push_steps[:: SMALL.phases]
     assert len(phases) >= 3
-    survived, unpushed = survival(policy, task, forces, phases, SMALL, threads=1)
-    assert survived.shape == (2, 3, len(phases))
+    outcome = pushed(policy, task, forces, phases, SMALL, threads=1)
+    survived = outcome.survived
+    assert survived.shape == outcome.recovered.shape == (2, 3, len(phases))
     monkeypatch.setattr("tsbench.evaluation.robustness._BLOCK", 5)
-    in_blocks, _ = survival(policy, task, forces, phases, SMALL, threads=1)
-    np.testing.assert_array_equal(in_blocks, survived)
-    assert unpushed == serial(task, policy).survived
+    in_blocks = pushed(policy, task, forces, phases, SMALL, threads=1)
+    np.testing.assert_array_equal(in_blocks.survived, survived)
+    np.testing.assert_array_equal(in_blocks.recovered, outcome.recovered)
+    assert outcome.calm == (serial(task, policy).survived, serial(task, policy).recovered)
     across, along = np.array(task.push_plane)
     for f, force in enumerate(forces):
         for p, phase in list(enumerate(phases))[:2]:
             for h, heading in enumerate(SMALL.directions()):
                 direction = math.cos(heading) * across + math.sin(heading) * along
                 push = Push(phase * task.timestep, 0.1, force * direction)
-                assert serial(task, policy, push).survived == survived[f, h, p], (f, h, p)
+                alone = serial(task, policy, push)
+                assert alone.survived == survived[f, h, p], (f, h, p)
+                assert alone.recovered == outcome.recovered[f, h, p], (f, h, p)
 
 
 def test_a_standing_robot_survives_small_pushes_and_no_large_ones() -> None:
@@ -202,8 +209,12 @@ def test_a_standing_robot_survives_small_pushes_and_no_large_ones() -> None:
     assert found.surface.forces_N == (50.0, 1000.0)
     assert found.surface.phases == (90, 96, 102, 108)
     assert np.array(found.surface.survived)[1].sum() == 0
-    assert found.impulse_50 == pytest.approx(5.0 + (100.0 - 5.0) / 2)  # half way from all to none
-    assert not found.impulse_50_is_lower_bound
+    half = 5.0 + (100.0 - 5.0) / 2  # half way from all to none
+    assert found.survival_impulse_50 == pytest.approx(half)
+    assert not found.survival_impulse_50_is_lower_bound
+    # It goes nowhere, pushed or not.
+    assert (found.recovery_100N, found.recovery_impulse_50) == (0.0, 0.0)
+    assert not np.any(found.surface.recovered)
 
 
 def test_an_episode_that_is_over_before_its_push_does_not_survive() -> None:
@@ -211,11 +222,8 @@ def test_an_episode_that_is_over_before_its_push_does_not_survive() -> None:
     task = tasks.make("rocket_navigation")
     found = robustness(lambda o: np.zeros((len(o), 2)), task, SMALL, threads=1)
     assert not np.any(found.surface.survived)
-    assert (found.survival_100N, found.impulse_50) == (0.0, 0.0)
-    assert found.survival_100N_interval[0] == 0.0
+    assert (found.survival_100N, found.survival_impulse_50) == (0.0, 0.0)
     assert len(found.surface.phases) == 3  # all of them are in the denominator
-    low, high = wilson(0, 3 * 3)
-    assert found.survival_100N_interval == (low, high)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing bounds address space")
@@ -280,14 +288,6 @@ def test_impulse_50_rises_with_survival(survived: list[float]) -> None:
     lower = impulse_50(impulses, np.array(survived))[0]
     better = impulse_50(impulses, np.minimum(np.array(survived) + 0.1, 1.0))[0]
     assert 0.0 <= lower <= better + 1e-9 <= impulses[-1] + 1e-9
-
-
-def test_wilson_by_hand() -> None:
-    """z = 1.96. All of 256: 256 / (256 + z^2). Half of 100: 0.5 +- 1.96 sqrt(0.25 / 103.84) ..."""
-    z = 1.959963984540054
-    assert wilson(256, 256) == pytest.approx((256 / (256 + z * z), 1.0))
-    half = z / (100 + z * z) * math.sqrt(100 * 0.25 + z * z / 4)
-    assert wilson(50, 100) == pytest.approx((0.5 - half, 0.5 + half))
 
 
 # The protocol
@@ -439,5 +439,6 @@ def test_an_early_end_counts_its_missing_steps() -> None:
     assert len(alone.rewards) < 180
     assert score.nominal.steps == len(alone.rewards)
     assert score.nominal.violations == 1.0
-    assert score.normalized_reward == pytest.approx(sum(alone.rewards) / 180, rel=1e-12)
+    reward = pytest.approx(sum(alone.rewards) / 180, rel=1e-12)
+    assert score.nominal.normalized_reward == reward
     assert score.robustness.survival_100N == 0.0

@@ -19,7 +19,7 @@ from tsbench.motion import ReferenceMotion
 from tsbench.sim.batched import Physics
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import sensor_slices
-from tsbench.state import Readings, State
+from tsbench.state import Batch, Readings
 from tsbench.task import Plannable, Task
 
 COUNT = 48
@@ -31,7 +31,7 @@ def converted(value: Any, convert: Callable[[np.ndarray], Any]) -> Any:
     """The same with every array converted, whatever holds it."""
     if isinstance(value, np.ndarray):
         return convert(value)
-    if isinstance(value, (State, Readings)):
+    if isinstance(value, (Batch, Readings)):
         fields = {
             f.name: converted(getattr(value, f.name), convert) for f in dataclasses.fields(value)
         }
@@ -57,7 +57,7 @@ def meta(values: np.ndarray) -> torch.Tensor:
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Every array in what a function returned."""
-    if isinstance(value, State):
+    if isinstance(value, Batch):
         value = vars(value)
     if isinstance(value, Mapping):
         for name, part in value.items():
@@ -80,7 +80,13 @@ def calls(task: Task[Any], reference: ReferenceMotion | None) -> Iterator[Call]:
     previous, state = (converted(one, single) for one in (previous, state))
     yield from _mdp_calls("task", task, previous, action, state)
     yield "goal_distance", task.goal_distance, (state,)
-    yield "success", task.success, (state,)
+    course = converted(task.followed(task.begun(previous), previous, state), single)
+    sums = converted(task.measured(previous, action, state), single)
+    steps = np.full(COUNT, 10)
+    yield "success", task.success, (state, course)
+    yield "measured", task.measured, (previous, action, state)
+    yield "measured, no action", task.measured, (previous, None, state)
+    yield "measures", task.measures, (previous, state, course, sums, steps)
     yield "control", task.control, (state, action)
     yield "memory", task.memory, (state,)
     yield "read", task.read, (_readings(physics, task, state),)
@@ -103,7 +109,7 @@ def calls(task: Task[Any], reference: ReferenceMotion | None) -> Iterator[Call]:
 
 
 def _mdp_calls(kind: str, mdp: Any, previous: Any, action: Any, state: Any) -> Iterator[Call]:
-    violated = np.arange(COUNT) % 2 == 0
+    course = mdp.begun(previous).replace(violated=np.arange(COUNT) % 2 == 0)
     yield f"{kind}.observation", mdp.observation, (state,)
     yield f"{kind}.value_observation", mdp.value_observation, (state,)
     yield f"{kind}.reward", mdp.reward, (previous, action, state)
@@ -111,9 +117,12 @@ def _mdp_calls(kind: str, mdp: Any, previous: Any, action: Any, state: Any) -> I
     yield f"{kind}.terminal", mdp.terminal, (state,)
     yield f"{kind}.reached", mdp.reached, (state,)
     yield f"{kind}.violated", mdp.violated, (state,)
-    yield f"{kind}.spared", mdp.spared, (state, violated)
-    yield f"{kind}.credit", mdp.credit, (state.time,)
-    yield f"{kind}.credit, discounted", mdp.credit, (state.time, 0.99)
+    yield f"{kind}.begun", mdp.begun, (previous,)
+    yield f"{kind}.followed", mdp.followed, (course, previous, state)
+    yield f"{kind}.spared", mdp.spared, (state, course)
+    yield f"{kind}.quality", mdp.quality, (mdp.followed(course, previous, state),)
+    yield f"{kind}.credit", mdp.credit, (state.time, 0.5 * state.time)
+    yield f"{kind}.credit, discounted", mdp.credit, (state.time, 0.5 * state.time, 0.99)
 
 
 def _readings(physics: Physics[Any], task: Task[Any], state: Any) -> Readings:

@@ -18,7 +18,7 @@ from tsbench.sim.batched import Physics
 from tsbench.sim.model import compiled
 from tsbench.state import Start
 from tsbench.tasks import laikago
-from tsbench.tasks.laikago import Laikago, LaikagoState
+from tsbench.tasks.laikago import Laikago, LaikagoCourse, LaikagoState
 
 GAITS = ("laikago_walk", "laikago_trot")
 SOLE = 0.0265  # m, from a foot's centre down
@@ -69,6 +69,7 @@ def moved(leg: int, **shift: float) -> np.ndarray:
 
 
 FR, FL, RR, RL = range(4)
+NOMINAL = np.array([0.0, 0.67, -1.33] * 4)
 STEP = 1 / 30
 
 
@@ -84,7 +85,7 @@ def terms(task: Laikago, previous: LaikagoState, after: LaikagoState) -> list[fl
 
 
 @pytest.mark.parametrize(
-    ("name", "distance", "speed"), [("laikago_walk", 1.584, 0.264), ("laikago_trot", 3.78, 0.63)]
+    ("name", "distance", "speed"), [("laikago_walk", 1.25, 0.264), ("laikago_trot", 3.0, 0.63)]
 )
 def test_constants(name: str, distance: float, speed: float) -> None:
     task = make(name)
@@ -93,13 +94,13 @@ def test_constants(name: str, distance: float, speed: float) -> None:
     assert task.timestep == pytest.approx(STEP)
     assert task.distance == distance
     assert task.horizon == 180  # six seconds: 60 planning steps
-    assert distance / speed == pytest.approx(6.0)
+    assert distance / speed == pytest.approx(0.8 * 6.0, rel=0.02)  # who lags arrives too
     model = task.spec().compile()
     assert model.opt.timestep * task.substeps == pytest.approx(task.timestep)
     np.testing.assert_allclose(model.site("goal").pos[:2], [distance, 0.0])
 
 
-@pytest.mark.parametrize(("distance", "horizon"), [(1.26, 60), (2.52, 120), (6.3, 300)])
+@pytest.mark.parametrize(("distance", "horizon"), [(1.0, 60), (2.0, 120), (5.0, 300)])
 def test_the_horizon_grows_with_the_distance(distance: float, horizon: int) -> None:
     assert make("laikago_trot", distance=distance).horizon == horizon
 
@@ -110,11 +111,11 @@ def test_the_horizon_grows_with_the_distance(distance: float, horizon: int) -> N
 @pytest.mark.parametrize(
     ("name", "base", "expected"),
     [
-        ("laikago_walk", (0.0, 0.0, 0.42), 0.01906311),  # exp(-2.5 x 1.584) = exp(-3.96)
-        ("laikago_trot", (0.0, 0.0, 0.42), 7.868957e-05),  # exp(-9.45)
-        ("laikago_walk", (1.584, 0.0, 0.3), 1.0),  # on the ground plane: height is nothing
-        ("laikago_walk", (1.184, 0.3, 0.42), 0.2865048),  # 0.4 before, 0.3 beside: exp(-1.25)
-        ("laikago_walk", (1.984, -0.3, 0.42), 0.2865048),
+        ("laikago_walk", (0.0, 0.0, 0.42), 0.04393693),  # exp(-2.5 x 1.25) = exp(-3.125)
+        ("laikago_trot", (0.0, 0.0, 0.42), 5.530844e-04),  # exp(-7.5)
+        ("laikago_walk", (1.25, 0.0, 0.3), 1.0),  # on the ground plane: height is nothing
+        ("laikago_walk", (0.85, 0.3, 0.42), 0.2865048),  # 0.4 before, 0.3 beside: exp(-1.25)
+        ("laikago_walk", (1.65, -0.3, 0.42), 0.2865048),
     ],
 )
 def test_r_dist(name: str, base: Any, expected: float) -> None:
@@ -156,7 +157,7 @@ def test_dragging_in_trot() -> None:
         ("laikago_walk", 0.1, moved(FL, z=0.1), 1.0),
         ("laikago_walk", 0.1, moved(FL, z=0.13), 0.5488116),  # exp(-20 x 0.03)
         ("laikago_walk", 0.1, moved(FR, z=-0.02), 0.0907180),  # exp(-20 x (0.1 + 0.02))
-        ("laikago_walk", 0.0, STANDING, 1.0),  # all stand
+        ("laikago_walk", 0.0, moved(FL, z=0.1), 1.0),  # it lifts off at the start
         ("laikago_trot", 0.1, STANDING, 0.01831564),  # two should be up: exp(-4)
     ],
 )
@@ -177,8 +178,8 @@ def test_reward_is_the_product() -> None:
     """Walk, 0.1 s, 0.5 m from the goal; FR slips 1 cm forward, FL is 9 cm up."""
     feet = moved(FL, z=0.09)
     feet[FR, 0] += 0.01
-    before = state(0.1 - STEP, base=(1.084, 0.0, 0.42))
-    after = state(0.1, base=(1.084, 0.0, 0.42), feet=feet)
+    before = state(0.1 - STEP, base=(0.75, 0.0, 0.42))
+    after = state(0.1, base=(0.75, 0.0, 0.42), feet=feet)
     reward = make("laikago_walk").reward(before, np.zeros((1, 12)), after)[0]
     # exp(-2.5 x 0.5 - 10 x 0.01 - 20 x 0.01 - 4 x 0.01) = exp(-1.59)
     assert reward == pytest.approx(0.2039256, rel=1e-6)
@@ -200,28 +201,28 @@ def schedule(name: str, rate: float, cycles: int) -> list[str]:
 @pytest.mark.parametrize(
     ("name", "rate", "expected"),
     [
-        # A foot stands from touchdown to lift-off, both included.
+        # A foot stands from touchdown on, and at lift-off no longer.
         (
             "laikago_walk",
             30,  # 24 frames; swings of 0.2 s, in the order FL, RR, FR, RL
             [
-                "#############.....######",
-                "#.....##################",
-                "#######.....############",
-                "###################.....",
+                "############......######",
+                "......##################",
+                "######......############",
+                "##################......",
             ],
         ),
         (
             "laikago_trot",
             30,  # 16 frames; swings of 0.267 s, FL with RR and FR with RL
             [
-                "#########.......",
-                "#.......########",
-                "#.......########",
-                "#########.......",
+                "########........",
+                "........########",
+                "........########",
+                "########........",
             ],
         ),
-        ("laikago_walk", 10, ["#####.##", "#.######", "###.####", "#######."]),
+        ("laikago_walk", 10, ["####..##", "..######", "##..####", "######.."]),
     ],
 )
 def test_contact_schedule(name: str, rate: float, expected: list[str]) -> None:
@@ -265,8 +266,8 @@ def test_observation() -> None:
         *(4.0, 5.0, 6.0),
         0.2,  # of six seconds
         *(0.0, -1.0),  # one and a half cycles of 0.8 s
-        *(1.184, 0.3),
-        1.221415,  # sqrt(1.401856 + 0.09)
+        *(0.85, 0.3),
+        0.9013878,  # sqrt(0.7225 + 0.09)
     ]
     task = make("laikago_walk")
     np.testing.assert_allclose(task.observation(at)[0], expected, atol=1e-6)
@@ -276,20 +277,20 @@ def test_observation() -> None:
 
 # Endings
 
-D = 1.584
+D = 1.25
 
 
 @pytest.mark.parametrize(
     ("base", "com_height", "reached", "violated", "terminal"),
     [
         ((0.0, 0.0, 0.42), 0.41, False, False, False),
-        ((D - 0.0501, 0.0, 0.42), 0.41, False, False, False),
-        ((D - 0.0499, 0.0, 0.42), 0.41, True, False, True),
-        ((D, 0.0499, 0.42), 0.41, True, False, True),
-        ((-0.0499, 0.0, 0.42), 0.41, False, False, False),
-        ((-0.0501, 0.0, 0.42), 0.41, False, False, True),
-        ((D, D + 0.0499, 0.42), 0.41, False, False, False),
-        ((D, D + 0.0501, 0.42), 0.41, False, False, True),
+        ((D - 0.1001, 0.0, 0.42), 0.41, False, False, False),
+        ((D - 0.0999, 0.0, 0.42), 0.41, True, False, True),
+        ((D, 0.0999, 0.42), 0.41, True, False, True),
+        ((-0.0999, 0.0, 0.42), 0.41, False, False, False),
+        ((-0.1001, 0.0, 0.42), 0.41, False, False, True),
+        ((D, D + 0.0999, 0.42), 0.41, False, False, False),
+        ((D, D + 0.1001, 0.42), 0.41, False, False, True),
         ((0.0, 0.0, 0.42), 0.3201, False, False, False),
         ((0.0, 0.0, 0.42), 0.3199, False, True, True),
         ((0.0, 0.0, 0.30), 0.3201, False, False, False),  # it is the CoM that counts
@@ -305,18 +306,128 @@ def test_endings(
     assert task.terminal(at).tolist() == [terminal]
 
 
+# Footfall
+
+
+def course(stance: float, swing: float, violated: bool = False, walked: float = 1.0) -> Any:
+    """Of an episode whose feet did as scheduled in these shares of its stance and swing."""
+    return LaikagoCourse(
+        violated=np.array([violated]),
+        nearest=np.array([0.0]),
+        stance=np.array([0.5 * walked]),
+        stance_kept=np.array([0.5 * walked * stance]),
+        swing=np.array([0.5 * walked]),
+        swing_kept=np.array([0.5 * walked * swing]),
+    )
+
+
 @pytest.mark.parametrize(
-    ("base_x", "com_height", "solved"),
+    ("base_x", "at", "solved"),
     [
-        (D - 0.3167, 0.41, True),  # a fifth of the distance is 0.3168 m
-        (D - 0.3169, 0.41, False),
-        (D + 0.3167, 0.3201, True),
-        (D, 0.3199, False),
+        (D - 0.0999, course(0.9, 0.7001), True),
+        (D - 0.1001, course(1.0, 1.0), False),  # not there
+        (D, course(0.9, 0.6999), False),  # the mean of both shares is below 0.8
+        (D, course(1.0, 0.0), False),  # dragged
+        (D, course(1.0, 1.0, violated=True), False),
+        (D, course(1.0, 1.0, walked=0.0), False),  # nothing says how it got there
     ],
 )
-def test_success(base_x: float, com_height: float, solved: bool) -> None:
-    at = state(base=(base_x, 0.0, 0.42), com_height=com_height)
-    assert make("laikago_walk").success(at).tolist() == [solved]
+def test_success(base_x: float, at: LaikagoCourse, solved: bool) -> None:
+    there = state(base=(base_x, 0.0, 0.42))
+    assert make("laikago_walk").success(there, at).tolist() == [solved]
+
+
+@pytest.mark.parametrize(
+    ("stance", "swing", "quality"),
+    [(1.0, 1.0, 1.0), (0.9, 0.8, 0.7), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.1, 0.2, 0.0)],
+)
+def test_what_a_spared_step_is_worth(stance: float, swing: float, quality: float) -> None:
+    """Twice the agreement less one, and never less than nothing."""
+    assert make("laikago_trot").quality(course(stance, swing))[0] == pytest.approx(quality)
+
+
+def test_footfall_by_hand() -> None:
+    """Trot, 0.1 s: FR and RL are to stand, FL and RR to swing. Only ground that is gained counts,
+    and a sole is on the ground below 1 cm."""
+    task = make("laikago_trot")
+
+    def at(x: float, feet: np.ndarray = STANDING) -> LaikagoState:
+        return state(0.1, base=(x, 0.0, 0.42), feet=feet)
+
+    so_far = task.begun(at(0.0))
+    assert task.footfall(so_far)[0] == 0.0
+    so_far = task.followed(so_far, at(0.0), at(0.02))  # dragged
+    assert task.footfall(so_far)[0] == pytest.approx(0.5)
+    raised = moved(FL, z=0.0101) + moved(RR, z=0.0099) - STANDING  # one of the two swings
+    so_far = task.followed(so_far, at(0.02), at(0.08, raised))  # three times as far
+    assert task.footfall(so_far)[0] == pytest.approx(0.5 * (1.0 + 0.75 * 0.5))
+    # What is not gained does not count: standing still, going back, coming to where one was.
+    perfect = moved(FL, z=0.1) + moved(RR, z=0.1) - STANDING
+    for before, after in ((0.08, 0.08), (0.08, 0.03), (0.03, 0.08)):
+        so_far = task.followed(so_far, at(before), at(after, perfect))
+    assert task.footfall(so_far)[0] == pytest.approx(0.5 * (1.0 + 0.75 * 0.5))
+    assert so_far.nearest[0] == pytest.approx(task.distance - 0.08)
+    flying = STANDING + np.array([0.0, 0.0, 0.05])
+    so_far = task.followed(so_far, at(0.08), at(0.16, flying))
+    assert task.footfall(so_far)[0] == pytest.approx(0.5 * (0.5 + (0.375 + 1.0) / 2))
+    assert not so_far.violated[0]
+    fallen = replace(at(0.17), com=np.array([[0.17, 0.0, 0.31]]))
+    assert task.followed(so_far, at(0.16), fallen).violated[0]
+
+
+# Measures
+
+
+def test_work_by_hand() -> None:
+    """Two joints of FR turn at 1 and -2 rad/s, 0.1 rad short of their held targets: the thigh's
+    220 x 0.1 - 2 x 1 = 20 N m; the calf's 220 x 0.1 + 2 x 2 = 26 N m. The abduction of FL turns at
+    3 rad/s and is asked for 220 x 0.2 - 0.3 x 3 = 43.1 N m, of which its motor gives 18.954."""
+    task = make("laikago_walk")
+    at = state()
+    position, velocity = np.tile(NOMINAL, (1, 1)), np.zeros((1, 12))
+    position[0, [1, 2, 3]] -= [0.1, 0.1, 0.2]
+    velocity[0, [1, 2, 3]] = [1.0, -2.0, 3.0]
+    at = replace(at, joint_position=position, joint_velocity=velocity)
+    work = task.work(at, np.zeros((1, 12)))
+    assert work[0] == pytest.approx((20.0 + 52.0 + 3.0 * 18.954) / 30.0)
+
+
+def test_what_a_step_measures() -> None:
+    """Without the distance, the reward of `test_reward_is_the_product`: exp(-0.34)."""
+    task, feet = make("laikago_walk"), moved(FL, z=0.09)
+    feet[FR, 0] += 0.01
+    before, after = state(0.1 - STEP), state(0.1, feet=feet)
+    found = task.measured(before, np.zeros((1, 12)), after)
+    assert found["gait"][0] == pytest.approx(math.exp(-0.34))
+    assert found["work"][0] == task.work(before, np.zeros((1, 12)))[0]
+    assert set(task.measured(before, None, after)) == {"gait"}
+
+
+def test_measures_by_hand() -> None:
+    """Of two walks of 60 steps: 1.2 m in 2 s, to the goal, and a few centimetres."""
+    task = make("laikago_walk")
+    first = state(base=(0.0, 0.0, 0.42)).rows([0, 0])
+    last = LaikagoState.joined(
+        [state(2.0, base=(1.2, 0.0, 0.42)), state(2.0, base=(0.03, 0.04, 0.42))]
+    )
+    both = LaikagoCourse.joined([course(0.9, 0.8), course(1.0, 0.0)])
+    sums = {"gait": np.array([30.0, 15.0]), "work": np.array([299.0, 10.0])}
+    found = task.measures(first, last, both, sums, np.array([60, 60]))
+    assert list(found) == list(task.measure_notes)
+    expected = {
+        "footfall agreement": [0.85, 0.5],
+        "time to the goal, s": [2.0, math.nan],
+        "speed over the gait's bound": [0.6 / 0.264, 0.025 / 0.264],
+        "gait": [0.5, 0.25],
+        "cost of transport": [299.0 / (25.433 * 9.81 * 1.2), math.nan],
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-6, err_msg=name)
+    spoiled = both.replace(violated=np.array([True, False]))
+    found = task.measures(first, last, spoiled, sums, np.array([60, 60]))
+    assert np.isnan(found["time to the goal, s"]).all()  # it arrived by falling
+    del sums["work"]
+    assert "cost of transport" not in task.measures(first, last, both, sums, np.array([60, 60]))
 
 
 # Action and filter
@@ -330,9 +441,6 @@ def controls(actions: np.ndarray, start: LaikagoState | None = None) -> np.ndarr
         at = replace(at, filter=memory)
         targets.append(target[0])
     return np.array(targets)
-
-
-NOMINAL = np.array([0.0, 0.67, -1.33] * 4)
 
 
 def test_filter_is_a_butterworth_low_pass() -> None:
@@ -414,20 +522,31 @@ def test_reference_of_the_naive_plan(
 ) -> None:
     task, plan, reference = make(name), naive_plan(name), naive_reference(name)
     times = np.arange(reference.steps + 1) * STEP
-    assert times[-1] == pytest.approx(plan.times[-1])
+    assert reference.steps == task.horizon
+    planned = len(plan.times)
+    assert planned < task.horizon  # it arrives early, and the reference goes on
     np.testing.assert_array_equal(reference.tracked["contacts"], task.gait.contacts(times))
     # The base goes straight ahead at top speed, once the feet have left their hips' sides.
     speed = task.gait.base_speed
-    np.testing.assert_allclose(reference.qpos[:, 0], speed * times, atol=0.03)
+    np.testing.assert_allclose(reference.qpos[:planned, 0], speed * times[:planned], atol=0.03)
     np.testing.assert_allclose(reference.qpos[:, 1:3], [[0.0, 0.42]] * len(times), atol=1e-3)
-    np.testing.assert_allclose(reference.qvel[60:, 0], speed, atol=1e-9)
+    np.testing.assert_allclose(reference.qvel[60 : planned - 1, 0], speed, atol=1e-9)
+    # Then it slows down to the goal, and steps in place there.
+    beyond = reference.qvel[planned - 1 :, 0]
+    assert np.diff(beyond).max() < 0.01
+    assert np.abs(beyond[-10:]).max() < 0.01
+    np.testing.assert_allclose(reference.qpos[-1, :2], [task.distance, 0.0], atol=2e-3)
+    cycle = round(task.gait.period * 30)
+    hips = STANDING[:, 0] + task.distance
+    np.testing.assert_allclose(reference.tracked["feet"][-cycle:, :, 0], [hips] * cycle, atol=0.02)
     # Feet rest in stance, and in swing rise in a half sine of 10 cm and go forward.
     soles = reference.tracked["feet"][..., 2] - SOLE
     assert np.abs(soles[reference.tracked["contacts"]]).max() < 2e-4
     steps = np.diff(reference.tracked["feet"][..., 0], axis=0)
     stance = reference.tracked["contacts"][1:] & reference.tracked["contacts"][:-1]
     assert np.abs(steps[stance]).max() < 3e-4
-    assert steps[~stance].min() > -3e-4
+    assert steps[: planned - 1][~stance[: planned - 1]].min() > -3e-4
+    assert steps[~stance].min() > -3e-3  # at the goal they settle under their hips
     share = (task.gait.phase(times) - task.gait.duty) / (1.0 - task.gait.duty)
     wanted = 0.1 * np.sin(np.pi * np.clip(share, 0.0, 1.0))
     assert np.abs(soles - wanted)[~reference.tracked["contacts"]].max() < 2e-4
@@ -458,12 +577,15 @@ def test_a_swing_by_hand(
     planned = np.interp(reference.times, plan.times, plan.states[:, 3 + 3 * FL])
     touchdown = planned[8]
     assert touchdown > 0.35
-    np.testing.assert_allclose(planned[8:17], touchdown, atol=1e-9)
+    np.testing.assert_allclose(planned[8:16], touchdown, atol=1e-9)
+    # It stands at the mean from touchdown to lift-off, where the plan's foot has begun to move.
+    stands = planned[8:17].mean()
+    assert stands == pytest.approx(touchdown, abs=0.006)
     # Eased as s^2 (3 - 2 s) = 2.5 / 16, raised by 0.1 sin(45 degrees).
-    quarter = 0.21935 + 0.15625 * (touchdown - 0.21935)
+    quarter = 0.21935 + 0.15625 * (stands - 0.21935)
     expected = [quarter, 0.1245, SOLE + 0.0707107]
     np.testing.assert_allclose(reference.tracked["feet"][2, FL], expected, atol=2e-4)
-    np.testing.assert_allclose(reference.tracked["feet"][8:17, FL, 0], touchdown, atol=2e-4)
+    np.testing.assert_allclose(reference.tracked["feet"][8:17, FL, 0], stands, atol=2e-4)
 
 
 @pytest.mark.parametrize("name", GAITS)

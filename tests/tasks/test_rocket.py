@@ -15,7 +15,7 @@ from tsbench import TsbenchError, tasks
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.planning.path import Path
 from tsbench.sim.batched import Physics
-from tsbench.state import Start
+from tsbench.state import Course, Start
 from tsbench.tasks.rocket import Rocket, RocketState
 
 COS30, SIN30 = 0.8660254037844387, 0.5
@@ -185,6 +185,45 @@ def test_collision(clearance: tuple[float, float], collision: bool) -> None:
     assert task.terminal(at).tolist() == [False]  # it only costs
 
 
+def test_leaving_the_world_is_a_violation() -> None:
+    outside = state((-10.001, 0.0))
+    for name, mishap in (
+        ("rocket_navigation", "leaving the world"),
+        ("rocket_obstacles", "a collision or leaving the world"),
+    ):
+        task = rocket(name)
+        assert task.violated(outside).all()
+        assert task.terminal(outside).all()
+        assert not task.violated(state((-9.999, 0.0))).any()
+        assert task.mishap == mishap
+
+
+def test_what_a_step_measures() -> None:
+    """Main engine at 0.6: 30 N, side at -0.5: 5 N; below half throttle, none."""
+    task = rocket()
+    near, far = state(off_goal(0.999)), state(off_goal(1.001))
+    found = task.measured(far, np.array([[0.6, -0.5]]), near)
+    assert found["away"][0] == 0.0
+    assert found["impulse"][0] == pytest.approx(35.0 * 0.02)
+    found = task.measured(near, np.array([[0.49, 0.3]]), far)
+    assert found["away"][0] == pytest.approx(0.02)
+    assert found["impulse"][0] == 0.0
+    assert set(task.measured(near, None, far)) == {"away"}
+
+
+def test_measures_by_hand() -> None:
+    """Two flights: one to the end, one that leaves the world after 100 of 779 steps."""
+    task = rocket()
+    ends, course = state((0.0, 0.0), (1.0, 1.0)), Course(violated=np.array([False, True]))
+    sums = {"away": np.array([9.0, 2.0]), "impulse": np.array([300.0, 0.0])}
+    found = task.measures(ends, ends, course, sums, np.array([779, 100]))
+    assert list(found) == list(task.measure_notes)
+    np.testing.assert_allclose(found["time away from the goal, s"], [9.0, 2.0 + 679 * 0.02])
+    np.testing.assert_allclose(found["impulse of the engines, N s"], [300.0, 0.0])
+    del sums["impulse"]
+    assert len(task.measures(ends, ends, course, sums, np.array([779, 100]))) == 1
+
+
 def test_nothing_to_collide_with() -> None:
     assert not rocket().violated(state((0.0, 0.0), clearance=())).any()
 
@@ -195,7 +234,9 @@ def test_nothing_to_collide_with() -> None:
 )
 def test_success(distance: float, speed: float, solved: bool) -> None:
     at = state(off_goal(distance), velocity=(0.6 * speed, -0.8 * speed))
-    assert rocket().success(at).tolist() == [solved]
+    for violated in (False, True):
+        course = Course(violated=np.array([violated]))
+        assert rocket().success(at, course).tolist() == [solved and not violated]
     assert rocket().goal_distance(at)[0] == pytest.approx(distance)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,8 +31,10 @@ def test_an_episode_is_the_one_that_is_scored() -> None:
     assert len(recording.times) == len(recording.states.time) == score.nominal.steps + 1
     assert recording.goal_distance[-1] == score.nominal.goal_distance
     earned = recording.reward_terms["reward"].sum() / (task.max_reward * task.horizon)
-    assert earned == pytest.approx(score.normalized_reward, rel=1e-12)
-    assert (recording.solved, recording.violated) == (False, False)
+    assert earned == pytest.approx(score.nominal.normalized_reward, rel=1e-12)
+    assert (recording.solved, recording.violated) == (False, True)  # it leaves the world
+    for name, value in recording.measures.items():
+        assert value == pytest.approx(score.nominal.measures[name]), name
     np.testing.assert_array_equal(recording.qpos[0], 0.0)
     np.testing.assert_allclose(recording.controls, [(35.0, 0.0)] * len(recording.actions))
 
@@ -60,6 +63,18 @@ def test_who_stands_still_is_held_where_his_mass_is() -> None:
     np.testing.assert_array_equal(support.feet, recording.states.feet)
 
 
+def test_contacts_are_of_the_step_that_led_to_a_state() -> None:
+    """The schedule is paired with them: a force upwards in step 120 lifts the feet that the state
+    at its end, 121, is about."""
+    still = record_episode(tasks.make("laikago_trot"), steadily(*[0.0] * 12))
+    forces = still.forces.copy()
+    forces[120, 1:, 2] = 1000.0  # on every body
+    contacts = replace(still, forces=forces).support.contacts
+    assert contacts[119:121].all()
+    assert not contacts[121].any()
+    assert contacts[122:].all()
+
+
 def test_a_push_is_recorded_as_it_acted() -> None:
     recording = record_episode(
         tasks.make("laikago_trot"),
@@ -82,10 +97,13 @@ def test_a_motion_is_seen_as_the_task_sees_it(
     task, motion = tasks.make("laikago_walk"), naive_reference("laikago_walk")
     recording = record_motion(task, motion)
     assert recording.duration == pytest.approx(motion.duration)
-    assert recording.goal_distance[0] == pytest.approx(1.584)
+    assert recording.goal_distance[0] == pytest.approx(1.25)
     np.testing.assert_allclose(recording.support.feet, motion.tracked["feet"], atol=1e-9)
     assert recording.scheduled is not None
     np.testing.assert_array_equal(recording.scheduled, motion.tracked["contacts"])
     assert recording.solved is None
+    # All but the samples where a half sine begins, still below 1 cm.
+    assert 0.9 < (recording.measures["footfall agreement"] or 0.0) < 1.0
+    assert "cost of transport" not in recording.measures  # nothing acted
     with pytest.raises(TsbenchError, match="is for laikago_walk version 1, not for laikago_trot"):
         record_motion(tasks.make("laikago_trot"), motion)

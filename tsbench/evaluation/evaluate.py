@@ -10,13 +10,12 @@ import numpy as np
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import Origin
-from tsbench.evaluation.protocol import V1, Protocol, perturbed_starts
+from tsbench.evaluation.protocol import V1, Condition, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import robustness
 from tsbench.evaluation.score import Score, Summary
 from tsbench.motion import ActionLog
 from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
-from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
 from tsbench.state import Start
@@ -48,21 +47,23 @@ def evaluate(
     origin = Origin.here(task, protocol, policy)
     if progress is not None:
         policy = _watched(policy, task, protocol, progress)
-    nominal = play(task, Physics(task, 1, threads=threads), policy, 1)
+    here = Condition(protocol.name, protocol.physics)
     starts = perturbed_starts(task, protocol)
-    perturbed = _play(policy, task, starts, threads)
     some = starts.rows(slice(0, protocol.changed))
-    first = _summary(task, nominal)
+    nominal = _play(policy, task, task.start(np.random.default_rng(0), 1), here, threads)
+    perturbed = _play(policy, task, starts, here, threads)
+    summary = _summary(task, perturbed)
     return Score(
         protocol=protocol.name,
-        normalized_reward=first.normalized_reward,
-        optimality=float(nominal.returns[0]) / best_return(task),
-        success=first.success,
-        nominal=first,
-        perturbed=_summary(task, perturbed),
+        solved_reward=summary.solved_reward,
+        normalized_reward=summary.normalized_reward,
+        success=summary.success,
+        against_plan=float(perturbed.returns.mean()) / best_return(task),
+        perturbed=summary,
+        nominal=_summary(task, nominal),
         changes={
             condition.name: _summary(
-                task, _play(policy, task, some, threads, condition.change, condition.delay)
+                task, _play(policy, task, some, condition.on(protocol.physics), threads)
             )
             for condition in protocol.conditions
         },
@@ -122,23 +123,35 @@ def _play(
     policy: PolicyFunction,
     task: Task[Any],
     starts: Start,
-    threads: int | None,
-    change: Change | None = None,
-    delay: int = 0,
+    condition: Condition,
+    threads: int | None = None,
 ) -> Episodes[Any]:
     count = len(starts.time)
-    physics: Physics[Any] = Physics(task, count, threads=threads, change=change)
+    physics: Physics[Any] = Physics(task, count, threads=threads, change=condition.change)
     begin = physics.place(np.arange(count), starts)
-    return play(task, physics, policy, count, begin=begin, delay=delay)
+    delay = condition.delay
+    return play(task, physics, policy, count, begin=begin, delay=delay, measure=task.measured)
 
 
 def _summary(task: Task[Any], episodes: Episodes[Any]) -> Summary:
-    solved = task.success(episodes.final, episodes.course)
+    solved = np.asarray(task.success(episodes.final, episodes.course), bool)
+    found = task.measures(
+        episodes.first, episodes.final, episodes.course, episodes.sums, episodes.lengths
+    )
     return Summary(
         episodes=len(solved),
         normalized_reward=float(episodes.normalized.mean()),
+        solved_reward=float((episodes.normalized * solved).mean()),
         success=float(solved.mean()),
         violations=float(episodes.course.violated.mean()),
         steps=float(episodes.lengths.mean()),
         goal_distance=float(task.goal_distance(episodes.final).mean()),
+        measures={name: known_mean(values) for name, values in found.items()},
+        solved=tuple(solved.astype(int).tolist()),
     )
+
+
+def known_mean(values: np.ndarray) -> float | None:
+    """Over the finite ones; None where there are none."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else None

@@ -52,6 +52,10 @@ class Condition:
     change: Change = field(default_factory=Change)
     delay: int = 0
 
+    def on(self, physics: Change) -> Condition:
+        """The same on top of another physics."""
+        return replace(self, change=self.change.after(physics))
+
 
 @dataclass(frozen=True)
 class Protocol:

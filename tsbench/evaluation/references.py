@@ -18,11 +18,13 @@ from tsbench import tasks
 from tsbench.adapters import ForeignPolicy, from_function
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.oracle import best_return
+from tsbench.evaluation.origin import constants_hash
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.score import Score
 from tsbench.task import MDP, Task
 
 FILE = Path(__file__).with_name("references.json")
+ROBUSTNESS = ("survival_100N", "recovery_100N", "survival_impulse_50", "recovery_impulse_50")
 DECIMALS = 6  # of an observation that the random policy tells apart
 
 
@@ -55,15 +57,18 @@ def named(path: Path, mdp: MDP[Any]) -> ForeignPolicy | None:
 def rows(task: Task[Any]) -> dict[str, Any]:
     """The oracle's return and row, and those of the reference policies by protocol v1."""
     best = best_return(task)
+    most = best / (task.max_reward * task.horizon)
     oracle = {
-        "normalized_reward": best / (task.max_reward * task.horizon),
-        "optimality": 1.0,
+        "solved_reward": most,
+        "normalized_reward": most,
         "success": 1.0,
+        "against_plan": 1.0,
     }
     policies = {name: row(evaluate(make(task), task)) for name, make in sorted(POLICIES.items())}
     return {
         "task_version": task.version,
         "protocol": V1.name,
+        "constants": constants_hash(task),
         "best_return": best,
         "rows": {"oracle": oracle, **policies},
     }
@@ -72,12 +77,11 @@ def rows(task: Task[Any]) -> dict[str, Any]:
 def row(score: Score) -> dict[str, Any]:
     """The figures of a score that a reader compares with."""
     return {
-        "normalized_reward": score.normalized_reward,
-        "optimality": score.optimality,
-        "success": score.success,
-        "perturbed_success": score.perturbed.success,
-        "survival_100N": score.robustness.survival_100N,
-        "impulse_50": score.robustness.impulse_50,
+        **{
+            name: getattr(score, name)
+            for name in ("solved_reward", "normalized_reward", "success", "against_plan")
+        },
+        **{name: getattr(score.robustness, name) for name in ROBUSTNESS},
     }
 
 
@@ -85,6 +89,17 @@ def stored(task: str) -> dict[str, Any]:
     """What `rows` gave for a task, from the file."""
     content: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))[task]
     return content
+
+
+def beside(score: Score) -> dict[str, dict[str, Any]]:
+    """The rows of the reference policies, by name, that a score can be read beside: of the same
+    task by the same protocol. None for a task that has none, or has other constants here."""
+    content = json.loads(FILE.read_text(encoding="utf-8")).get(score.origin.task, {})
+    if (score.protocol, score.origin.constants) != (
+        content.get("protocol"), content.get("constants"),
+    ):  # fmt: skip
+        return {}
+    return {name: content["rows"][name] for name in POLICIES}
 
 
 if __name__ == "__main__":

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Generic
 
 import numpy as np
 
-from tsbench.arrays import step_of
+from tsbench.arrays import Array, step_of
 from tsbench.sim.batched import Dynamics, expect_finite
 from tsbench.state import Course, S
 from tsbench.task import MDP
@@ -30,7 +30,10 @@ class Episodes(Generic[S]):
         diverged: whether that happened, shape (n,).
         cut: whether it ended for a reason other than its goal or its last step, shape (n,).
         credit: what the spared steps earn (`MDP.credit`), shape (n,).
+        first: the state that each episode began in, or went on from.
         final: the last state of each episode.
+        sums: what `measure` gave, summed over the steps of each episode, by name, each of shape
+            (n,); a step that the physics could not compute counts as nothing.
         states: what `record` made of every state, start included, shape (T + 1, n, ...), each
             episode's last one repeated after its end; None without `record`.
         actions: as they were applied, shape (T, n, action_size), zero once an episode has ended.
@@ -45,7 +48,9 @@ class Episodes(Generic[S]):
     diverged: np.ndarray
     cut: np.ndarray
     credit: np.ndarray
+    first: S
     final: S
+    sums: dict[str, np.ndarray]
     states: np.ndarray | None
     actions: np.ndarray
     max_reward: float
@@ -78,7 +83,9 @@ def play(
     record: Callable[[S], np.ndarray] | None = None,
     *,
     begin: S | None = None,
+    course: Course | None = None,
     delay: int = 0,
+    measure: Callable[[S, Array, S], Mapping[str, Array]] | None = None,
 ) -> Episodes[S]:
     """Plays `count` episodes.
 
@@ -90,19 +97,22 @@ def play(
         seed: of their starts.
         record: what to keep of all states.
         begin: the states to go on from instead of new starts; `dynamics` must be there.
+        course: that led to them, by default none.
         delay: steps between an action's observation and its use; zero actions come before it.
+        measure: what to sum over the steps of each episode, by name (`Task.measured`).
 
     Raises:
         NotFiniteError: a number in action, state or reward is not finite.
     """
     rows = np.arange(count)
     state = dynamics.begin(np.random.default_rng(seed), rows) if begin is None else begin
-    final = state
+    first = final = state
     begun = step_of(state.time, mdp.timestep)
     limits = mdp.horizon - begun
     longest = int(limits.max())
     diverged, cut = (np.zeros(count, bool) for _ in range(2))
-    course = mdp.begun(state)
+    course = mdp.begun(state) if course is None else course
+    sums: dict[str, np.ndarray] = {}
     lengths, spared = np.zeros(count, int), np.zeros(count, int)
     rewards = np.zeros((longest, count))
     actions = np.zeros((longest, count, mdp.action_size))
@@ -121,6 +131,9 @@ def play(
         lengths[rows] += 1
         expect_finite(lengths[rows], state, action, following, reward, rows)
         rewards[step, rows] = reward
+        if measure is not None:
+            for name, value in measure(state, action, following).items():
+                sums.setdefault(name, np.zeros(count))[rows] += np.where(failed, 0.0, value)
         actions[step, rows] = action
         diverged[rows] = failed
         passed = mdp.followed(course.rows(rows), state, following)
@@ -149,7 +162,9 @@ def play(
         diverged=diverged,
         cut=cut,
         credit=mdp.credit(spared, mdp.quality(course)),
+        first=first,
         final=final,
+        sums=sums,
         states=np.stack(recorded) if record else None,
         actions=actions,
         max_reward=mdp.max_reward,

@@ -6,8 +6,10 @@ World frame: x to the right, z up, in metres; angles counter-clockwise from upri
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -121,8 +123,19 @@ class Rocket(Plannable[RocketState]):
     action_size = 2
     max_reward = C.goal_weight
     imitation_forms = ("progress", "paper")
+    measure_notes = MappingProxyType(
+        {
+            "time away from the goal, s": "more than 1 m from it",
+            "impulse of the engines, N s": "what fuel is spent on; hovering costs 12.5 a second",
+        }
+    )
     pushed = "rocket"
     push_plane = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+
+    @property
+    def mishap(self) -> str:
+        away = "leaving the world"
+        return f"a collision or {away}" if self.obstacles else away
 
     @cached_property
     def goal(self) -> np.ndarray:
@@ -209,6 +222,39 @@ class Rocket(Plannable[RocketState]):
         speed = xp.linalg.vector_norm(state.velocity, axis=-1)
         there = (self.goal_distance(state) < C.success_distance) & (speed < C.success_speed)
         return there & ~course.violated
+
+    # Measures
+
+    def measured(
+        self, previous: RocketState, action: Array | None, state: RocketState
+    ) -> dict[str, Array]:
+        xp = array_namespace(state.position)
+        away = xp.astype(self.goal_distance(state) >= C.success_distance, state.position.dtype)
+        sums = {"away": self.timestep * away}
+        if action is None:
+            return sums
+        force, _ = self.control(previous, action)
+        return {**sums, "impulse": self.timestep * xp.sum(xp.abs(force), axis=-1)}
+
+    def measures(
+        self,
+        first: RocketState,
+        last: RocketState,
+        course: Course,
+        sums: Mapping[str, Array],
+        steps: Array,
+    ) -> dict[str, Array]:
+        """How long the rocket was away from its goal, and what it spent.
+
+        time away from the goal, s: more than a success's distance from it; what an episode that
+            ends early leaves of its horizon counts as away.
+        impulse of the engines, N s: of main and side engines, each as the integral of its force.
+        """
+        missing = self.timestep * (self.horizon - steps)
+        found = {"time away from the goal, s": sums["away"] + missing}
+        if "impulse" in sums:
+            found["impulse of the engines, N s"] = sums["impulse"]
+        return found
 
     # The physics
 

@@ -109,32 +109,36 @@ def joints(recording: Recording, plan: Recording) -> str:
 
 
 def robustness(surface: Surface, timestep: float) -> str:
-    """The share of pushes that the robot survives, by force and direction and by force and when.
+    """The share of pushes that are survived, and below that are recovered from, by force and
+    direction and by force and when.
 
     Args:
-        surface: every push, and whether it was survived.
+        surface: every push, and what came of it.
         timestep: seconds of a control step.
     """
-    survived = np.asarray(surface.survived, float)
     phases = [f"{phase * timestep:.2f}" for phase in surface.phases]
     forces, headings = surface.forces_N, np.degrees(surface.headings_rad)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
-        panels = figure.subplots(1, 2)
-    for panel, share, ticks, label in (
-        (panels[0], survived.mean(axis=2), [f"{h:.0f}" for h in headings],
-         "direction of the push, degrees (0 ahead, 90 left or up)"),
-        (panels[1], survived.mean(axis=1), phases,
-         "beginning of the push, s"),
-    ):  # fmt: skip
-        image = panel.imshow(
-            share, origin="lower", aspect="auto", vmin=0.0, vmax=1.0, cmap="cividis"
-        )
-        every = -(-len(ticks) // 8)  # more would overlap
-        panel.set_xticks(range(0, len(ticks), every), ticks[::every])
-        panel.set_yticks(range(len(forces)), [f"{force:.3g}" for force in forces])
-        panel.set(xlabel=label, ylabel="force, N")
-    figure.colorbar(image, ax=panels, label="share of pushes survived")
+        figure = Figure(figsize=(WIDTH, 6.0), layout="constrained")
+        grid = figure.subplots(2, 2)
+    for row, held, what in (
+        (grid[0], surface.survived, "survived"),
+        (grid[1], surface.recovered, "recovered"),
+    ):
+        shares = np.asarray(held, float)
+        for panel, share, ticks, label in (
+            (row[0], shares.mean(axis=2), [f"{h:.0f}" for h in headings],
+             "direction of the push, degrees (0 ahead, 90 left or up)"),
+            (row[1], shares.mean(axis=1), phases, "beginning of the push, s"),
+        ):  # fmt: skip
+            image = panel.imshow(
+                share, origin="lower", aspect="auto", vmin=0.0, vmax=1.0, cmap="cividis"
+            )
+            every = -(-len(ticks) // 8)  # more would overlap
+            panel.set_xticks(range(0, len(ticks), every), ticks[::every])
+            panel.set_yticks(range(len(forces)), [f"{force:.3g}" for force in forces])
+            panel.set(xlabel=label, ylabel="force, N")
+        figure.colorbar(image, ax=list(row), label=f"share of pushes {what}")
     return svg(figure, "robustness")
 
 

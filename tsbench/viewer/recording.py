@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,14 +10,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tsbench.evaluation.evaluate import check_fit
+from tsbench.evaluation.evaluate import check_fit, known_mean
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.model import sensor_slices
 from tsbench.sim.push import Push
-from tsbench.state import Readings, S, State
+from tsbench.state import Readings, State
 from tsbench.task import Task, plannable
 
 Array = NDArray[np.float64]
@@ -38,7 +37,7 @@ class Recording:
         states: of the task, with time as the batch axis.
         actions: shape (T, action_size).
         solved: whether it counts as a success at its end; None along a plan.
-        violated: whether a fall or collision spoiled it.
+        violated: whether a mishap spoiled it (`Task.mishap`).
     """
 
     task: Task[Any]
@@ -72,6 +71,21 @@ class Recording:
         before, after = self.states.rows(slice(0, -1)), self.states.rows(slice(1, None))
         terms = self.task.reward_terms(before, self.actions, after)
         return {**terms, "reward": self.task.reward(before, self.actions, after)}
+
+    @cached_property
+    def measures(self) -> dict[str, float | None]:
+        """`Task.measures` of the motion, those that need actions only where something acted."""
+        task = self.task
+        before, after = self.states.rows(slice(0, -1)), self.states.rows(slice(1, None))
+        sums = task.measured(before, None if self.solved is None else self.actions, after)
+        first, last = self.states.rows(slice(0, 1)), self.states.rows(slice(-1, None))
+        course = task.begun(first)
+        for step in range(len(self.qpos) - 1):
+            one = slice(step, step + 1)
+            course = task.followed(course, before.rows(one), after.rows(one))
+        whole = {name: values.sum(keepdims=True) for name, values in sums.items()}
+        found = task.measures(first, last, course, whole, np.array([len(self.qpos) - 1]))
+        return {name: known_mean(value) for name, value in found.items()}
 
     @cached_property
     def scheduled(self) -> NDArray[np.bool_] | None:
@@ -135,7 +149,7 @@ def record_episode(task: Task[Any], policy: PolicyFunction, push: Push | None = 
         qvel=qvel,
         controls=controls[1:],
         forces=forces[1:].reshape(length, -1, 6),
-        states=joined(states),
+        states=State.joined(states),
         actions=episode.actions[:length, 0],
         solved=bool(task.success(episode.final, episode.course)[0]),
         violated=bool(episode.course.violated[0]),
@@ -179,16 +193,9 @@ def record_motion(task: Task[Any], motion: ReferenceMotion) -> Recording:
     )
 
 
-def joined(states: Sequence[S]) -> S:
-    """States one after the other along the first batch axis."""
-    fields = vars(states[0])
-    return states[0].replace(
-        **{name: np.concatenate([getattr(state, name) for state in states]) for name in fields}
-    )
-
-
 def _support(recording: Recording) -> Support:
-    """The forces are those that MuJoCo finds for each state and the step that begins there."""
+    """The forces are those that MuJoCo finds for each state and the step that led there, as the
+    schedule and the reward pair it; for the first state, the step that begins there."""
     model = recording.task.spec().compile()
     feet = [model.geom(name).id for name in recording.task.drawing().feet]
     fixed = model.body_weldid[model.geom_bodyid] == 0  # of geoms: the ground
@@ -198,7 +205,7 @@ def _support(recording: Recording) -> Support:
     com, pressure = np.zeros((count, 3)), np.full((count, 3), np.nan)
     wrench = np.zeros(6)
     for frame in range(count):
-        step = min(frame, count - 2)
+        step = max(frame - 1, 0)
         data.qpos[:], data.qvel[:] = recording.qpos[frame], recording.qvel[frame]
         data.ctrl[:], data.xfrc_applied[:] = recording.controls[step], recording.forces[step]
         mujoco.mj_forward(model, data)

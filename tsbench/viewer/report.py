@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from tsbench.errors import TsbenchError
 from tsbench.evaluation.score import Score
 from tsbench.files import write_new
 from tsbench.record import RunDirectory
-from tsbench.task import plannable
+from tsbench.task import Task, plannable
 from tsbench.viewer import charts, page
 from tsbench.viewer.compose import foot_bands
 from tsbench.viewer.recording import Recording, record_episode
@@ -24,6 +25,7 @@ from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR
 from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words, run_subject
 
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
+LEADING = 2  # measures that the verdict tells
 
 
 def write_pages(run: RunDirectory) -> None:
@@ -79,7 +81,7 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
             "title": html.escape(subject.title),
             "plan": page.css(PLAN_COLOUR),
             "executed": page.css(EXECUTED_COLOUR),
-            "answers": "".join(_answers(subject.score.score, recording, plan)),
+            "answers": "".join(_answers(subject, recording, plan)),
             "view": html.escape(view),
             "sections": "".join(_sections(subject, run, recording, plan)),
         },
@@ -87,25 +89,44 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
     return view, report
 
 
-def _answers(score: Score, recording: Recording, plan: Recording | None) -> Iterator[str]:
+def _answers(subject: Subject, recording: Recording, plan: Recording | None) -> Iterator[str]:
+    assert subject.score is not None
+    score = subject.score.score
     planned = "Nothing: this method learns to act directly, without a plan."
     if plan is not None:
         planned = planned_in_words(plan) + " No physics binds it."
     for kind, title, text in (
         ("plan", "What was planned", planned),
         ("executed", "What was executed", executed_in_words(recording)),
-        ("score", "How good it is", _worth_in_words(score)),
+        ("score", "How good it is", worth_in_words(score, subject.task)),
     ):
-        yield f'<section class="{kind}"><h2>{title}</h2><p>{html.escape(text)}</p></section>'
+        leads = kind == "score"
+        verdict = f'<p class="verdict">{tables.verdict(score.perturbed)}</p>' if leads else ""
+        yield (
+            f'<section class="{kind}"><h2>{title}</h2>{verdict}<p>{html.escape(text)}</p></section>'
+        )
 
 
-def _worth_in_words(score: Score) -> str:
-    solved, spoiled = tables.counts(score.perturbed)
-    return (
-        f"It earns {score.optimality:.0%} of the reward of the best motion known under the "
-        f"planner's speed limits. From {score.perturbed.episodes} starts a little different from "
-        f"the task's own it solves the task {solved} times, and falls or collides {spoiled} times."
+def worth_in_words(score: Score, task: Task[Any]) -> str:
+    """What the score says, what matters most first."""
+    perturbed, robustness = score.perturbed, score.robustness
+    solved, spoiled = tables.counts(perturbed)
+    text = (
+        f"From {perturbed.episodes} starts a little different from the task's own the policy "
+        f"solves the task {solved} times; {spoiled} episodes are spoiled by {task.mishap}."
     )
+    for name, value in [*perturbed.measures.items()][:LEADING]:
+        note = task.measure_notes.get(name)
+        if value is not None:
+            text += f" {name[0].upper()}{name[1:]}: {tables.number(value)}"
+            text += f" ({note})." if note else "."
+    text += (
+        f" It earns {score.normalized_reward:.1%} of the largest possible reward, "
+        f"{tables.number(score.against_plan)} times what the best plan would. Of all pushes of "
+        f"{tables.claim_force(score):.3g} N for {robustness.push_duration_s:g} s it survives "
+        f"{robustness.survival_100N:.0%}, and solves the task after {robustness.recovery_100N:.0%}."
+    )
+    return text
 
 
 def _sections(
@@ -118,25 +139,26 @@ def _sections(
         yield _section(
             "Foot contacts",
             "Blue: when each foot was to stand on the ground. Orange: when it pressed on it, in "
-            f"full physics. {_agreement(recording)}",
+            f"full physics. {agreement_in_words(recording)}",
             charts.contacts(bands, duration),
         )
     yield _section(
         "Reward of each step",
         "What the task pays, and the terms that it is made of. Blue: what the plan would earn if "
-        "the robot could follow it exactly. Orange: what was executed.",
+        "it were followed exactly. Orange: what was executed.",
         charts.rewards(recording, plan),
     )
     if plan is not None:
         yield _section(
-            "Joints",
+            "Joints" if recording.task.drawing().feet else "Position and angle",
             "Planned in blue, executed in orange; the typical error is the root of the mean "
             "square, at equal times.",
             charts.joints(recording, plan),
         )
     yield _section(
         "Robustness",
-        "Pushes on the robot's body: which it survives without a fall.",
+        f"Pushes on its body, each tried once. Survived: the episode went on without "
+        f"{subject.task.mishap} and without straying. Recovered: the task was solved as well.",
         charts.robustness(subject.score.score.robustness.surface, subject.task.timestep),
     )
     metrics = run.metrics_file
@@ -150,20 +172,28 @@ def _sections(
         "Numbers",
         f"Everything in this page comes from {run.path.name}/; the same score again: tsbench "
         "evaluate. How the run was made is in config.yaml and versions.json.",
-        f'<div class="tables">{"".join(_tables(subject, run))}</div>',
+        f'<div class="tables">{"".join(_tables(subject, run, plan))}</div>',
     )
 
 
-def _agreement(recording: Recording) -> str:
+def agreement_in_words(recording: Recording) -> str:
+    """How often the feet did what the schedule asks for where each step ends."""
     if recording.scheduled is None:
         return ""
-    share = np.mean(recording.scheduled == recording.support.contacts)
-    return f"Both agree {share:.0%} of the time."
+    share = np.mean(recording.scheduled[1:] == recording.support.contacts[1:])
+    return f"They did as scheduled {share:.0%} of the time."
 
 
-def _tables(subject: Subject, run: RunDirectory) -> Iterator[str]:
+def _tables(subject: Subject, run: RunDirectory, planned: Recording | None) -> Iterator[str]:
     assert subject.score is not None
-    yield _table(_score_rows(subject.score.score))
+    yield _table(_score_rows(subject, planned))
+    changes = [
+        (name, f"{tables.counts(change)[0]} of {change.episodes}",
+         tables.number(change.normalized_reward))
+        for name, change in subject.score.score.changes.items()
+    ]  # fmt: skip
+    yield _table([("changed physics", "solved", "normalized_reward"), *changes])
+    yield _table([("pushes", ""), *tables.pushes(subject.score.score)])
     costs = [
         (stage.name, f"{stage.steps:,}", f"{stage.physics_substeps:,}",
          tables.duration(stage.seconds))
@@ -181,15 +211,16 @@ def _tables(subject: Subject, run: RunDirectory) -> Iterator[str]:
         yield _table([("can physics follow the plan?", "measured", "allowed", ""), *items])
 
 
-def _score_rows(score: Score) -> Table:
-    own, perturbed = vars(score.nominal), vars(score.perturbed)
-    rows = [("score", "task's own start", f"{perturbed['episodes']} other starts")]
-    for name in own:
-        if name != "episodes":
-            label = name.replace("_", " ") + (", m" if name == "goal_distance" else "")
-            rows.append((label, tables.number(own[name]), tables.number(perturbed[name])))
-    rows.append(("optimality", tables.number(score.optimality), ""))
-    rows += [(label, value, "") for label, value in tables.pushes(score)]
+def _score_rows(subject: Subject, plan: Recording | None) -> Table:
+    """The figures of all episodes, beside what the reference motion would have."""
+    assert subject.score is not None
+    score, notes = subject.score.score, {**tables.FIGURES, **subject.task.measure_notes}
+    planned = {} if plan is None else plan.measures
+    beside = ("reference motion",) if planned else ()
+    rows = [("score", f"{score.perturbed.episodes} other starts", "task's own start", *beside, "")]
+    for name, value, own in tables.episode_rows(score, subject.task):
+        reference = (tables.number(planned[name]) if name in planned else "",) if planned else ()
+        rows.append((name, value, own, *reference, notes.get(name, "")))
     return rows
 
 

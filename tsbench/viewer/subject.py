@@ -72,7 +72,7 @@ class Subject:
             plan,
             title=self.title,
             verdict=" ".join([*sentences, executed_in_words(recording)]),
-            summary=tables.summary(self.score.score) if self.score else (),
+            summary=tables.summary(self.score.score, self.task) if self.score else (),
         )
 
 
@@ -170,6 +170,6 @@ def planned_in_words(plan: Recording) -> str:
 def executed_in_words(recording: Recording) -> str:
     end = f"{recording.goal_distance[-1]:.2f} m from the goal after {recording.duration:.1f} s"
     if recording.violated:
-        return f"In full physics the policy falls or collides on the way; it ends {end}."
+        return f"In full physics the policy ends {end}, spoiled by {recording.task.mishap}."
     verdict = "which solves the task" if recording.solved else "which does not solve the task"
     return f"In full physics the policy ends {end}, {verdict}."
