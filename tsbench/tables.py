@@ -66,7 +66,7 @@ def score_table(title: str, score: Score, task: Task[Any]) -> Table:
     )
     table.add_column(f"protocol {score.protocol}")
     table.add_column(f"{perturbed.episodes} perturbed starts", justify="right")
-    table.add_column("task's own start", justify="right")
+    table.add_column("own start", justify="right")
     table.add_row(verdict(perturbed), style="bold")
     for label, value, own in episode_rows(score, task):
         table.add_row(label, value, own)
@@ -105,7 +105,7 @@ def _push_rows(score: Score) -> Iterator[tuple[str, str, str]]:
     """Labels, and values of survival and of recovery."""
     robustness = score.robustness
     yield (
-        f"of {claim_force(score):.3g} N (survival_100N, recovery_100N)",
+        f"of {claim_force(score):.3g} N (survival_, recovery_100N)",
         f"{robustness.survival_100N:.1%}",
         f"{robustness.recovery_100N:.1%}",
     )

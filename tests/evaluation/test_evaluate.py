@@ -12,8 +12,8 @@ import pytest
 
 import tsbench
 from tsbench import TsbenchError, tasks
-from tsbench.evaluation.evaluate import check_fit, evaluate, known_mean
-from tsbench.evaluation.oracle import best_return
+from tsbench.evaluation.evaluate import check_fit, evaluate
+from tsbench.evaluation.oracle import best_return, known_mean
 from tsbench.evaluation.protocol import SMOKE, Protocol
 from tsbench.evaluation.score import Summary
 from tsbench.policy import Policy, PolicyInfo

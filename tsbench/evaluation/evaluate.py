@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tsbench.errors import TsbenchError
-from tsbench.evaluation.oracle import best_return
+from tsbench.evaluation.oracle import best_return, known_mean
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import V1, Condition, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import robustness
@@ -149,9 +149,3 @@ def _summary(task: Task[Any], episodes: Episodes[Any]) -> Summary:
         measures={name: known_mean(values) for name, values in found.items()},
         solved=tuple(solved.astype(int).tolist()),
     )
-
-
-def known_mean(values: np.ndarray) -> float | None:
-    """Over the finite ones; None where there are none."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else None

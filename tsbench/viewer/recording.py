@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tsbench.evaluation.evaluate import check_fit, known_mean
+from tsbench.evaluation.evaluate import check_fit
+from tsbench.evaluation.oracle import outcome
 from tsbench.motion import ReferenceMotion
 from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
@@ -75,17 +76,9 @@ class Recording:
     @cached_property
     def measures(self) -> dict[str, float | None]:
         """`Task.measures` of the motion, those that need actions only where something acted."""
-        task = self.task
-        before, after = self.states.rows(slice(0, -1)), self.states.rows(slice(1, None))
-        sums = task.measured(before, None if self.solved is None else self.actions, after)
-        first, last = self.states.rows(slice(0, 1)), self.states.rows(slice(-1, None))
-        course = task.begun(first)
-        for step in range(len(self.qpos) - 1):
-            one = slice(step, step + 1)
-            course = task.followed(course, before.rows(one), after.rows(one))
-        whole = {name: values.sum(keepdims=True) for name, values in sums.items()}
-        found = task.measures(first, last, course, whole, np.array([len(self.qpos) - 1]))
-        return {name: known_mean(value) for name, value in found.items()}
+        return outcome(
+            self.task, self.states, None if self.solved is None else self.actions
+        ).measures
 
     @cached_property
     def scheduled(self) -> NDArray[np.bool_] | None:
