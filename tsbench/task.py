@@ -4,7 +4,8 @@ Four interfaces, each of which adds to the one before:
 
 - `MDP`: observations, rewards and endings of states, whatever steps them.
 - `SimulatedTask`: an MDP that is stepped in full physics, by the `Plant` that it names.
-- `Task`: that can be scored: what success is, when to push, which motion is the best known.
+- `Task`: that can be scored: what success is, what else to measure, when to push, which motion is
+  the best known.
 - `Plannable`: with a planning variant (`Abstraction`) and an imitation variant (`Tracker`).
 
 A new task is one class that implements `Task` or `Plannable`. Everything here is pure functions
