@@ -13,10 +13,16 @@ from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import POLICIES, random, stored
 
+KEPT = {name: rows for name in tasks.names() if (rows := stored(name)) is not None}
 
-@pytest.mark.parametrize("name", tasks.names())
+
+def test_there_are_some() -> None:
+    assert KEPT
+
+
+@pytest.mark.parametrize("name", KEPT)
 def test_the_oracle_is_remade(name: str) -> None:
-    task, content = tasks.make(name), stored(name)
+    task, content = tasks.make(name), KEPT[name]
     assert content["task_version"] == task.version
     assert content["protocol"] == V1.name
     assert content["best_return"] == pytest.approx(best_return(task), rel=1e-12)
@@ -28,10 +34,10 @@ def test_the_oracle_is_remade(name: str) -> None:
 
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))
-@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("name", KEPT)
 def test_the_reference_policies_are_remade(name: str, policy: str) -> None:
     """With those pushes alone between which half of them are survived."""
-    task, row = tasks.make(name), stored(name)["rows"][policy]
+    task, row = tasks.make(name), KEPT[name]["rows"][policy]
     few = replace(V1, conditions=(), phases=8, forces=(100.0, 150.0))
     score = evaluate(POLICIES[policy](task), task, protocol=few, threads=1)
     assert score.normalized_reward == pytest.approx(row["normalized_reward"], rel=1e-9)
