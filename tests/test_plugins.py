@@ -53,7 +53,7 @@ METHOD = '''
 
 from dataclasses import replace
 
-from tsbench.methods.twostage import Options
+from tsbench.methods.twostage import STAGES, Options
 from tsbench.methods import twostage
 
 
@@ -253,6 +253,8 @@ def test_a_broken_method_is_told_when_it_is_used(toy: Toy, tmp_path: Path) -> No
     assert done.stderr == (
         "tsbench: the plug-in toy-tasks 1.0 cannot be used: ZeroDivisionError: division by zero\n"
     )
+    done = call(tmp_path, "run", f"task={SOME}", "--cfg", "job")
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_missing_module_and_a_single_one(toy: Toy, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ cart = "cart_package.task"  # registers tasks under names of its own choice
 lazy = "cart_package.lazy"  # is the method `lazy`
 
 Its package has, as tsbench has, the files `conf/task/TASK.yaml`, `conf/method/METHOD.yaml` and
-`models/MODEL.xml`. A plug-in that cannot be imported is refused in one line, and stops nothing else.
+`models/MODEL.xml`. A plug-in that cannot be imported is refused in one line; the others work.
 """
 
 from __future__ import annotations
@@ -117,7 +117,6 @@ class Plugin:
         Raises:
             TsbenchError: it cannot be imported.
         """
-        self.provider.folder()
         with self.provider.explained():
             return importlib.import_module(self.module)
 

@@ -77,7 +77,7 @@ def prepare(config: RunConfig) -> Problem:
     )
     name = config.method["name"]
     methods.options(methods.find(name).Options, problem)
-    known = {kind for method in methods.names() for kind in methods.stages(method)}
+    known = methods.all_stages()
     for kind in dict.fromkeys([*methods.stages(name), *config.task.training]):
         if kind not in known:
             raise unknown_key("task.training", kind, known)

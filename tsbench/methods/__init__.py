@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import pkgutil
+from contextlib import suppress
 from functools import cache
 from importlib.abc import InspectLoader
 from importlib.util import find_spec
@@ -94,6 +95,15 @@ def stages(name: str) -> tuple[str, ...]:
         TsbenchError: there is no such method, or it lacks a part.
     """
     return tuple(getattr(find(name), "STAGES", ()))
+
+
+def all_stages() -> set[str]:
+    """The kinds of PPO stages of all methods but those that cannot be imported."""
+    kinds: set[str] = set()
+    for name in names():
+        with suppress(TsbenchError):
+            kinds.update(stages(name))
+    return kinds
 
 
 def options(kind: type[Any], problem: Problem) -> Any:

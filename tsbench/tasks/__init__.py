@@ -120,6 +120,7 @@ def _broken() -> dict[str, str]:
     broken = {}
     for plugin in plugins.plugins(plugins.TASKS):
         try:
+            plugin.find()
             plugin.load()
         except TsbenchError as error:
             broken[plugin.provider.package] = str(error)
