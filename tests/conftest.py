@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 # Before numpy and torch are loaded, here and in the commands that tests start: the tests run side
@@ -24,8 +23,7 @@ from tsbench.evaluation.robustness import Robustness, Surface
 from tsbench.evaluation.score import Score, Summary
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.record import Record, Stage
-from tsbench.sim.kinematic import naive_plan
-from tsbench.task import plannable
+from tsbench.testing.episodes import plan_of, reference_of
 
 # How fast a machine is, or how busy, is no property of the code.
 settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -65,26 +63,16 @@ def perturbed_fixture() -> Callable[[float], AbstractContextManager[None]]:
     return perturbed
 
 
-@cache
-def _naive_plan(name: str) -> Plan:
-    return naive_plan(tasks.make(name))
-
-
-@cache
-def _naive_reference(name: str) -> ReferenceMotion:
-    return plannable(tasks.make(name)).reference(_naive_plan(name))
-
-
-@pytest.fixture(name="naive_plan", scope="session")
-def naive_plan_fixture() -> Callable[[str], Plan]:
+@pytest.fixture(scope="session")
+def naive_plan() -> Callable[[str], Plan]:
     """Of a task: the plan that its hand-made planner makes."""
-    return _naive_plan
+    return plan_of
 
 
 @pytest.fixture(scope="session")
 def naive_reference() -> Callable[[str], ReferenceMotion]:
     """Of a task: that plan as full poses."""
-    return _naive_reference
+    return reference_of
 
 
 @pytest.fixture(name="invented_record", scope="session")

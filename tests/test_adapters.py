@@ -204,7 +204,7 @@ def test_the_command_line(
     assert "protocol smoke" in shown
     assert "not to be ranked: protocol smoke asks too little" in shown
     for wrong, message in (
-        ([path], "task=NAME is missing; allowed: laikago_trot"),
+        ([path], f"task=NAME is missing; allowed: {', '.join(tasks.names())}"),
         ([path, "task=rocket"], "unknown task 'rocket'"),
         ([path, "rocket_navigation"], "expected task=NAME, not 'rocket_navigation'"),
         (["zero"], "task=NAME is missing"),

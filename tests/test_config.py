@@ -54,7 +54,7 @@ def test_words_change_values_and_open_mappings_need_no_plus() -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ([], "task=NAME is missing; allowed: laikago_trot, "),
+        ([], f"task=NAME is missing; allowed: {', '.join(tasks.names())}"),
         (["task=rocket_navigatoin"], "unknown task 'rocket_navigatoin'; allowed: "),
         (["task=rocket_navigatoin"], "(did you mean 'rocket_navigation'?)"),
         (["task=../x"], "unknown task '../x'"),

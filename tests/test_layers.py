@@ -18,8 +18,8 @@ ROOT = Path(tsbench.__file__).parent
 # What each room may know, lowest first; a room is a package or a file beside the packages.
 # What everyone may know, beside what stands before it in this list.
 CORE = (
-    "errors", "typed", "files", "arrays", "constants", "rotations", "drawing", "state", "motion",
-    "policy", "task", "problem",
+    "errors", "typed", "files", "plugins", "arrays", "constants", "rotations", "drawing", "state",
+    "motion", "policy", "task", "problem",
 )  # fmt: skip
 MAY_KNOW: dict[str, set[str]] = {
     **{module: set(CORE[:number]) for number, module in enumerate(CORE)},
@@ -47,23 +47,25 @@ MAY_KNOW: dict[str, set[str]] = {
     "launch": {*CORE, "config", "record", "tables", "viewer", "run"},
     "bench": {*CORE, "sim", "tasks", "rl", "methods", "config", "record", "workspace", "run"},
 }  # fmt: skip
-ROOFS = {"cli", "gym", "tsbench"}  # the commands and the public faces: they may know everything
+# The commands and the public faces: they may know everything.
+ROOFS = {"cli", "gym", "testing", "tsbench"}
 
 ONLY_IN: dict[str, set[str]] = {
-    "torch": {"rl"},
+    "torch": {"rl", "testing"},
     "rsl_rl": {"rl"},
     "tensordict": {"rl"},
     "threadpoolctl": {"rl", "evaluation"},
     "gymnasium": {"sim", "gym", "bench"},
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},
-    "dm_env": {"sim"},
+    "dm_env": {"sim", "testing"},
     "mujoco": {"task", "planning", "sim", "tasks", "viewer", "bench", "cli"},
     "safetensors": {"policy", "checkpoint"},
     "hydra": {"config", "launch"},
     "omegaconf": {"config", "launch"},
     "meshcat": {"viewer"},
     "matplotlib": {"curves", "viewer"},
+    "pytest": {"testing"},
     "tensorboard": {"events"},
     "rich": {"tables", "workspace", "run", "cli", "launch", "bench"},
 }

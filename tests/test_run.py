@@ -106,6 +106,7 @@ def test_versions_and_hashes(shown: tuple[Path, str]) -> None:
     assert content["packages"]["rsl-rl-lib"] == version("rsl-rl-lib")
     spec = tasks.make("rocket_navigation").spec()
     assert content["physics"] == {"rocket_navigation": compiled_hash(spec)}
+    assert content["plug-ins"] == {}
     assert Policy.load(shown[0]).info.physics == fingerprint(spec)
 
 

@@ -173,7 +173,7 @@ def _complete(words: Sequence[str]) -> None:
 def _list(words: Sequence[str]) -> None:
     parser = _parser("list")
     options = parser.parse_args(words)
-    from tsbench import config, methods, tasks
+    from tsbench import config, methods, plugins, tasks
     from tsbench.files import write_json
 
     made = {name: tasks.make(name) for name in tasks.names()}
@@ -188,6 +188,12 @@ def _list(words: Sequence[str]) -> None:
         for name, task in made.items()
     }
     summaries = {name: methods.summary(name) for name in methods.names()}
+    brought: dict[str, list[str]] = {}
+    for kind, names in ((tasks, rows), (methods, summaries)):
+        for name in names:
+            if (provider := kind.provider(name)) not in (None, plugins.own()):
+                brought.setdefault(str(provider), []).append(name)
+    refused = tuple(dict.fromkeys((*tasks.refused(), *methods.refused())))
     offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for header in ("task", "version", "seconds", *offered):
@@ -203,7 +209,11 @@ def _list(words: Sequence[str]) -> None:
     for name, summary in summaries.items():
         table.add_row(name, summary)
     console.print(table)
-    write_json(options.json, {"tasks": rows, "methods": summaries})
+    lines = [f"Plug-in {provider}: {', '.join(names)}" for provider, names in brought.items()]
+    for line in (*lines, *(f"Refused: {line}" for line in refused)):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    shown = {"tasks": rows, "methods": summaries, "plug-ins": brought, "refused": refused}
+    write_json(options.json, shown)
 
 
 def _short(steps: int) -> str:

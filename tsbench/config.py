@@ -1,7 +1,7 @@
 """The configuration of a run: `key=value` words, checked before anything starts.
 
-Hydra composes the words with the YAML files of `tsbench.conf`; here the result gets its types,
-and whatever is wrong with it becomes one line.
+Hydra composes the words with the YAML files of `tsbench.conf` and of plug-ins; here the result gets
+its types, and whatever is wrong with it becomes one line.
 """
 
 from __future__ import annotations
@@ -10,22 +10,26 @@ import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from importlib.resources import files
+from importlib.resources.abc import Traversable
 from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_module
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
 from hydra.errors import (
     CompactHydraException,
     HydraException,
     MissingConfigException,
     OverrideParseException,
 )
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from tsbench import plugins
 from tsbench.errors import TsbenchError, unknown
 from tsbench.problem import Budget
 from tsbench.typed import typed, unknown_key
@@ -98,6 +102,22 @@ class RunConfig:
                 raise TsbenchError(f"{key} must be at least 1, not {amount}")
 
 
+class PluginConfigurations(SearchPathPlugin):
+    """Shows Hydra the configurations of plug-ins. tsbench's own come first: none replaces them."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in list(plugins.configurations())[1:]:
+            search_path.append("plug-in", f"file://{folder}")
+
+
+@contextmanager
+def found_by_hydra() -> Iterator[None]:
+    """Within it, Hydra finds the configurations of tsbench and of plug-ins."""
+    Plugins.instance().register(PluginConfigurations)
+    with initialize_config_module(CONFIGURATIONS, version_base=VERSION_BASE):
+        yield
+
+
 def compose(words: Sequence[str]) -> RunConfig:
     """The configuration that `key=value` words select.
 
@@ -111,7 +131,7 @@ def compose(words: Sequence[str]) -> RunConfig:
         if override.is_sweep_override():
             raise TsbenchError(f"{override.input_line} asks for several runs: add -m for a sweep")
     try:
-        with one_line_errors(), initialize_config_module(CONFIGURATIONS, version_base=VERSION_BASE):
+        with one_line_errors(), found_by_hydra():
             node = hydra_compose("config", overrides=opened(words))
     except ValueError as error:  # Hydra's answer to a group's value that is no name
         raise TsbenchError(f"{_flat(error)} (in: {' '.join(words)})") from None
@@ -169,8 +189,7 @@ def parse_words(words: Sequence[str]) -> list[Override]:
 
 def names(group: str) -> tuple[str, ...]:
     """The configurations of a group ("task" or "method"), sorted."""
-    found = (files(CONFIGURATIONS) / group).iterdir()
-    return tuple(sorted(f.name.removesuffix(".yaml") for f in found if f.name.endswith(".yaml")))
+    return tuple(sorted(_files(group)))
 
 
 def budgets(task: str) -> dict[str, Budget]:
@@ -179,13 +198,23 @@ def budgets(task: str) -> dict[str, Budget]:
     Raises:
         TsbenchError: the configuration is wrong.
     """
-    if task not in names("task"):
+    file = _files("task").get(task)
+    if file is None:
         return {}
-    text = (files(CONFIGURATIONS) / "task" / f"{task}.yaml").read_text(encoding="utf-8")
     with one_line_errors():
-        plain = OmegaConf.to_container(OmegaConf.create(text), resolve=True)
+        plain = OmegaConf.to_container(OmegaConf.create(file.read_text("utf-8")), resolve=True)
     config: TaskConfig = typed(TaskConfig, plain, "task")
     return config.budgets
+
+
+def _files(group: str) -> dict[str, Traversable]:
+    """The files of a group by name; where two have one name, the one that Hydra takes."""
+    found: dict[str, Traversable] = {}
+    for folder in plugins.configurations(group):
+        for file in folder.iterdir():
+            if file.name.endswith(".yaml"):
+                found.setdefault(file.name.removesuffix(".yaml"), file)
+    return found
 
 
 @contextmanager
@@ -201,7 +230,7 @@ def one_line_errors() -> Iterator[None]:
             raise TsbenchError(_flat(error)) from None
         missing = str(error.missing_cfg_file)
         parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
-        raise unknown(parts[0], parts[2], error.options) from None
+        raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__
         if isinstance(cause, OmegaConfBaseException) and isinstance(cause.parent_node, DictConfig):

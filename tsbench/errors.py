@@ -45,18 +45,22 @@ class Stopped(KeyboardInterrupt):
         self.signal = signal
 
 
-def unknown(kind: str, given: str, allowed: Iterable[str]) -> TsbenchError:
+def unknown(
+    kind: str, given: str, allowed: Iterable[str], causes: Iterable[str] = ()
+) -> TsbenchError:
     """The error for a name that does not exist, with the nearest one that does.
 
     Args:
         kind: what was named, e.g. "task".
         given: the name given.
         allowed: the names that exist.
+        causes: why more names do not exist, a line each.
     """
     names = sorted(allowed)
     message = f"unknown {kind} '{given}'; allowed: {', '.join(names) or 'none'}"
     near = difflib.get_close_matches(given, names, n=1)
-    return TsbenchError(message + (f" (did you mean '{near[0]}'?)" if near else ""))
+    message += f" (did you mean '{near[0]}'?)" if near else ""
+    return TsbenchError("; ".join([message, *causes]))
 
 
 @contextmanager

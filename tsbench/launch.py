@@ -20,7 +20,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NoReturn
 
-from hydra import initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -209,7 +208,7 @@ def _hydra() -> Iterator[Any]:
     """Hydra, with tsbench's configurations. What it raises becomes one line."""
     with (
         config.one_line_errors(),
-        initialize_config_module(config.CONFIGURATIONS, version_base=config.VERSION_BASE),
+        config.found_by_hydra(),
     ):
         yield GlobalHydra.instance().hydra
 

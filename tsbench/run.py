@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from tsbench import methods, tables, tasks
+from tsbench import methods, plugins, tables, tasks
 from tsbench.config import RunConfig
 from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.evaluation.evaluate import evaluate
@@ -56,6 +56,7 @@ _NAMES = {  # of what has to stay the same, in words
     "python": "version of Python",
     "packages": "version of a package",
     "code": "version of tsbench's own code",
+    "plug-ins": "version of a plug-in",
     "physics": "model of the task",
 }
 
@@ -76,7 +77,7 @@ def prepare(config: RunConfig) -> Problem:
     )
     name = config.method["name"]
     methods.options(methods.find(name).Options, problem)
-    known = {kind for method in methods.names() for kind in methods.stages(method)}
+    known = methods.all_stages()
     for kind in dict.fromkeys([*methods.stages(name), *config.task.training]):
         if kind not in known:
             raise unknown_key("task.training", kind, known)
@@ -311,11 +312,17 @@ def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         code.update(path.read_bytes())
     configuration = json.dumps(config.identity, sort_keys=True)
+    brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
+    foreign = sorted(one for one in brought if one not in (None, plugins.own()))
     return {
         "configuration": hashlib.sha256(configuration.encode()).hexdigest(),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
         "code": code.hexdigest(),
+        "plug-ins": {
+            provider.distribution: {"version": provider.version, "code": provider.code()}
+            for provider in foreign
+        },
         "physics": {problem.task.name: compiled_hash(problem.task.spec())},
     }
 

@@ -19,8 +19,8 @@ NAMES = [str(entry.relative_to(BOARDS)) for entry in ENTRIES]
 
 
 def test_entries_are_of_tasks() -> None:
-    assert {entry.parts[-3] for entry in ENTRIES} == set(tasks.names())
     assert ENTRIES
+    assert {entry.parts[-3] for entry in ENTRIES} <= set(tasks.names())
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)

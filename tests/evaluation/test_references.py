@@ -14,10 +14,16 @@ from tsbench.evaluation.origin import constants_hash
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import POLICIES, beside, random, stored
 
+KEPT = {name: rows for name in tasks.names() if (rows := stored(name)) is not None}
 
-@pytest.mark.parametrize("name", tasks.names())
+
+def test_there_are_some() -> None:
+    assert KEPT
+
+
+@pytest.mark.parametrize("name", KEPT)
 def test_the_oracle_is_remade(name: str) -> None:
-    task, content = tasks.make(name), stored(name)
+    task, content = tasks.make(name), KEPT[name]
     assert content["task_version"] == task.version
     assert content["protocol"] == V1.name
     assert content["best_return"] == pytest.approx(best_return(task), rel=1e-12)
@@ -31,10 +37,10 @@ def test_the_oracle_is_remade(name: str) -> None:
 
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))
-@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("name", KEPT)
 def test_the_reference_policies_are_remade(name: str, policy: str) -> None:
     """With those pushes alone between which half of them are survived."""
-    task, row = tasks.make(name), stored(name)["rows"][policy]
+    task, row = tasks.make(name), KEPT[name]["rows"][policy]
     few = replace(V1, conditions=(), phases=8, forces=(100.0, 150.0, 200.0))
     score = evaluate(POLICIES[policy](task), task, protocol=few, threads=1)
     assert score.solved_reward == row["solved_reward"] == 0.0
@@ -54,7 +60,7 @@ def test_rows_stand_beside_scores_of_the_same_thing_only() -> None:
     score = evaluate(POLICIES["zero"](task), task, protocol=few, threads=1)
     assert set(beside(score)) == {"zero", "random"}
     assert (
-        beside(score)["zero"]["survival_100N"] == stored(task.name)["rows"]["zero"]["survival_100N"]
+        beside(score)["zero"]["survival_100N"] == KEPT[task.name]["rows"]["zero"]["survival_100N"]
     )
     assert beside(replace(score, protocol="smoke")) == {}
     origin = score.origin

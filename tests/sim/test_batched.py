@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any, cast
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -14,139 +13,15 @@ from tsbench import tasks
 from tsbench.motion import ReferenceMotion
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.kinematic import Planning
-from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
-from tsbench.state import Start, State
-from tsbench.task import SimulatedTask
+from tsbench.state import Start
+from tsbench.testing.episodes import compare, plannable_tasks, play_batched, same
 
 ROWS = 3
-Actions = Callable[[np.random.Generator, int, int], np.ndarray]
-
-
-@dataclass
-class Placed:
-    """A task whose episodes begin where the test says."""
-
-    task: SimulatedTask[Any]
-    starts: Start
-
-    def start(self, rng: np.random.Generator, count: int, *, perturbed: bool = False) -> Start:
-        assert count == len(self.starts.time)
-        return self.starts
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.task, name)
 
 
 def row(start: Start, index: int) -> Start:
     return Start(*(getattr(start, field.name)[index : index + 1] for field in fields(Start)))
-
-
-def same(first: State, second: State) -> bool:
-    """Whether two states are equal to the last bit."""
-    pairs = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(first)]
-    return all(a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
-
-
-def play_batched(
-    task: SimulatedTask[Any], starts: Start, actions: np.ndarray, threads: int = 1
-) -> tuple[list[Any], np.ndarray]:
-    """The states (T + 1) and rewards (T, rows) that `actions` (T, rows, a) lead to."""
-    physics = Physics(task, len(starts.time), threads=threads)
-    states = [physics.place(np.arange(len(starts.time)), starts)]
-    rewards = []
-    for action in actions:
-        states.append(physics.advance(states[-1], action))
-        rewards.append(task.reward(states[-2], action, states[-1]))
-    return states, np.array(rewards)
-
-
-def compare(task: SimulatedTask[Any], starts: Start, actions: np.ndarray) -> list[int]:
-    """Plays `actions` (T, rows, a) both ways from `starts`; the steps at which episodes end."""
-    states, rewards = play_batched(task, starts, actions, threads=2)
-    observations = [task.observation(state) for state in states]
-    ends = []
-    for index in range(len(starts.time)):
-        single = environment(cast(Any, Placed(task, row(starts, index))), seed=0)
-        time_step = single.reset()
-        first = round(float(starts.time[index]) / task.timestep)
-        step = 0
-        while True:
-            (observed,) = time_step.observation.values()
-            assert observed.tobytes() == observations[step][index].tobytes(), (index, step)
-            at = states[step].rows(slice(index, index + 1))
-            assert same(cast(Any, single.task).state, at), (index, step)
-            if time_step.last():
-                break
-            time_step = single.step(actions[step, index])
-            assert time_step.reward == rewards[step, index], (index, step)
-            step += 1
-            terminal = bool(task.terminal(states[step])[index])
-            assert time_step.last() == (terminal or first + step >= task.horizon)
-            assert time_step.discount == (0.0 if terminal else 1.0)
-        ends.append(first + step)
-    return ends
-
-
-def uniform(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    return rng.uniform(-1.0, 1.0, (steps, ROWS, size))
-
-
-def small(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    return 0.1 * rng.normal(size=(steps, ROWS, size))
-
-
-def wandering(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Smooth, and now and then outside the box."""
-    return np.cumsum(0.3 * rng.normal(size=(steps, ROWS, size)), axis=0)
-
-
-def zero(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    return np.zeros((steps, ROWS, size))
-
-
-def hover(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """The rocket's least thrust at every other step is its weight, 12.5 N."""
-    actions = np.zeros((steps, ROWS, size))
-    actions[::2, :, 0] = 0.5
-    return actions
-
-
-LAIKAGO: list[tuple[Actions, bool, bool]] = [  # actions, perturbed start, lasts to the horizon
-    (uniform, True, False),
-    (wandering, True, False),
-    (small, True, False),  # creeps backward
-    (zero, True, True),
-]
-ROCKET: list[tuple[Actions, bool, bool]] = [
-    (uniform, True, False),
-    (wandering, True, False),
-    (zero, True, False),
-    (hover, False, True),
-]
-
-
-@pytest.mark.parametrize("name", tasks.names())
-@pytest.mark.parametrize("regime", range(4))
-def test_equal_over_whole_episodes(name: str, regime: int) -> None:
-    actions, perturbed, to_the_end = (LAIKAGO if name.startswith("laikago") else ROCKET)[regime]
-    task = tasks.make(name)
-    rng = np.random.default_rng(11)
-    starts = task.start(rng, ROWS, perturbed=perturbed)
-    ends = compare(task, starts, actions(rng, task.horizon, task.action_size))
-    assert [end == task.horizon for end in ends] == [to_the_end] * ROWS
-
-
-@pytest.mark.parametrize("name", tasks.names())
-@pytest.mark.parametrize("actions", [uniform, small])
-def test_imitation_is_equal_over_whole_episodes(
-    name: str, actions: Actions, naive_reference: Callable[[str], ReferenceMotion]
-) -> None:
-    task = Imitation(tasks.make(name), naive_reference(name))
-    rng = np.random.default_rng(5)
-    starts = task.start(rng, ROWS)
-    assert np.any(starts.time > 0.0)
-    compare(task, starts, actions(rng, task.horizon, task.action_size))
 
 
 def test_equal_through_a_collision() -> None:
@@ -183,16 +58,15 @@ def test_rows_do_not_know_each_other(name: str) -> None:
     np.testing.assert_array_equal(rewards[:, order], permuted_rewards)
 
 
-@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("name", plannable_tasks())
 @pytest.mark.parametrize("variant", [None, "planning"])
 def test_episodes_begin_anew(name: str, variant: tsbench.Variant | None) -> None:
     """Several episodes on end: each is what a fresh environment would give."""
-    steps = 200 if variant and name.startswith("laikago") else 500
     batch = tsbench.load_batched(name, variant, count=2, threads=1)
+    steps = batch.mdp.horizon + 50  # at least one whole episode of each
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1.0, 1.0, (steps, 2, batch.mdp.action_size))
-    if name.startswith("laikago") and variant is None:
-        actions[30:220, 0] = 0.0  # for one, a second episode that lasts to the horizon
+    actions[30:, 0] = 0.0  # to one something else happens
     observations, transitions = [batch.reset()], []
     for action in actions:
         transitions.append(batch.step(action))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,9 @@ import pytest
 from tsbench import tasks
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
-from tsbench.state import State
+from tsbench.testing.episodes import one_of_each_kind, same
 
-NAMES = ("laikago_trot", "rocket_navigation")
-
-
-def same(first: State, second: State) -> bool:
-    """Whether two states are equal to the last bit."""
-    pairs = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(first)]
-    return all(a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
+NAMES = one_of_each_kind()
 
 
 def states(

@@ -15,14 +15,14 @@ import tsbench
 from tsbench import TsbenchError, tasks
 from tsbench.motion import ReferenceMotion
 from tsbench.sim.gym import GymEnvironment, GymVectorEnvironment
+from tsbench.testing.episodes import one_of_each_kind
 
 COUNT = 3
 
 
-def actions_of(name: str, steps: int, size: int) -> np.ndarray:
-    """(steps, COUNT, size): Laikago trips, the rocket without its main engine falls down."""
-    highest = 0.0 if name.startswith("rocket") else 1.0
-    return np.random.default_rng(7).uniform(-1.0, highest, (steps, COUNT, size))
+def actions_of(steps: int, size: int) -> np.ndarray:
+    """(steps, COUNT, size), none positive: Laikago trips, a rocket without main engine falls."""
+    return np.random.default_rng(7).uniform(-1.0, 0.0, (steps, COUNT, size))
 
 
 @pytest.mark.parametrize("perturbed", [False, True])
@@ -36,7 +36,7 @@ def test_gymnasium_finds_no_fault(name: str, perturbed: bool) -> None:
 
 
 @pytest.mark.parametrize("variant", [None, "planning", "imitation"])
-@pytest.mark.parametrize("name", ["laikago_trot", "rocket_obstacles"])
+@pytest.mark.parametrize("name", one_of_each_kind())
 def test_equal_to_the_dm_control_environment(
     name: str, variant: tsbench.Variant | None, naive_reference: Callable[[str], ReferenceMotion]
 ) -> None:
@@ -49,7 +49,7 @@ def test_equal_to_the_dm_control_environment(
     steps = 40 if variant == "planning" else 250  # inverse kinematics takes its time
     size = coated.single.task.mdp.action_size
     ends = 0
-    for action in actions_of(name, steps, size)[:, 0]:
+    for action in actions_of(steps, size)[:, 0]:
         assert observation.tobytes() == next(iter(time_step.observation.values())).tobytes()
         assert coated.observation_space.contains(observation)
         assert info == {}
@@ -127,7 +127,7 @@ def test_the_vector_environment_is_the_batched_one(name: str) -> None:
     assert observation.tobytes() == batched.reset().tobytes()
     assert infos == {}
     ends = np.zeros(COUNT, int)
-    for action in actions_of(name, 250, batched.mdp.action_size):
+    for action in actions_of(250, batched.mdp.action_size):
         transition = batched.step(action)
         observation, reward, terminated, truncated, infos = coated.step(action)
         assert observation.tobytes() == transition.observation.tobytes()
@@ -140,7 +140,7 @@ def test_the_vector_environment_is_the_batched_one(name: str) -> None:
     assert np.all(ends >= 1)
 
 
-@pytest.mark.parametrize("name", ["laikago_trot", "rocket_navigation"])
+@pytest.mark.parametrize("name", one_of_each_kind())
 def test_the_vector_environment_is_gymnasiums_own(name: str) -> None:
     """What SyncVectorEnv makes of single environments, final observations included."""
     own: Any = SyncVectorEnv(
@@ -154,7 +154,7 @@ def test_the_vector_environment_is_gymnasiums_own(name: str) -> None:
         assert getattr(coated, f"single_{space}") == getattr(own, f"single_{space}")
     assert coated.reset(seed=2)[0].tobytes() == own.reset(seed=2)[0].tobytes()
     seen = 0
-    for action in actions_of(name, 250, coated.batched.mdp.action_size):
+    for action in actions_of(250, coated.batched.mdp.action_size):
         *found, infos = coated.step(action)
         *expected, expected_infos = own.step(action)
         for array, other in zip(found, expected, strict=True):

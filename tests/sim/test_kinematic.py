@@ -16,8 +16,9 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import compiled
 from tsbench.tasks.laikago import PLAN_REACH, PLAN_TIMESTEP, LaikagoState
 from tsbench.tasks.rocket import RocketState
+from tsbench.testing.episodes import plannable_tasks
 
-NAMES = tasks.names()
+NAMES = plannable_tasks()
 HIPS = np.array([[0.21935, -0.1245], [0.21935, 0.1245], [-0.21935, -0.1245], [-0.21935, 0.1245]])
 SOLE = 0.0265
 REACH, DT = PLAN_REACH, PLAN_TIMESTEP  # calibrated; all else here is written out

@@ -67,36 +67,42 @@ def test_perturbed_starts_follow_one_another() -> None:
     np.testing.assert_array_equal(starts[0], expected)
 
 
-@pytest.mark.parametrize("name", ["laikago_trot", "rocket_obstacles"])
-def test_the_state_is_that_of_the_physics(name: str) -> None:
-    """Observations and sensors are current, not a substep behind."""
+def after_five_steps(name: str) -> tuple[Any, Any]:
+    """An environment and its state."""
     env = tsbench.load(name, seed=0, perturbed=True)
     env.reset()
     rng = np.random.default_rng(0)
     for _ in range(5):
         env.step(rng.uniform(-1.0, 1.0, env.action_spec().shape))
-    data, state = env.physics.data, cast(Any, adapter(env).state)
-    if name == "laikago_trot":
-        assert isinstance(state, LaikagoState)
-        np.testing.assert_array_equal(state.base_position[0], data.qpos[:3])
-        np.testing.assert_array_equal(state.joint_velocity[0], data.qvel[6:])
-        env.physics.forward()
-        for index, foot in enumerate(("FR_foot", "FL_foot", "RR_foot", "RL_foot")):
-            np.testing.assert_array_equal(
-                state.feet[0, index], env.physics.named.data.site_xpos[foot]
-            )
-        np.testing.assert_array_equal(state.com[0], env.physics.named.data.subtree_com["trunk"])
-        # What the actuators are told is the filtered action, which the state remembers.
-        np.testing.assert_array_equal(
-            data.ctrl, np.tile([0.0, 0.67, -1.33], 4) + state.filter[0, 24:36]
-        )
-    else:
-        np.testing.assert_array_equal(state.position[0], data.qpos[:2])
-        np.testing.assert_array_equal(state.velocity[0], data.qvel[:2])
-        before = data.sensordata.copy()
-        env.physics.forward()
-        np.testing.assert_array_equal(data.sensordata, before)
-        np.testing.assert_array_equal(state.clearance[0], before)
+    return env, adapter(env).state
+
+
+def test_laikagos_state_is_that_of_the_physics() -> None:
+    """Observations and sensors are current, not a substep behind."""
+    env, state = after_five_steps("laikago_trot")
+    data = env.physics.data
+    assert isinstance(state, LaikagoState)
+    np.testing.assert_array_equal(state.base_position[0], data.qpos[:3])
+    np.testing.assert_array_equal(state.joint_velocity[0], data.qvel[6:])
+    env.physics.forward()
+    for index, foot in enumerate(("FR_foot", "FL_foot", "RR_foot", "RL_foot")):
+        np.testing.assert_array_equal(state.feet[0, index], env.physics.named.data.site_xpos[foot])
+    np.testing.assert_array_equal(state.com[0], env.physics.named.data.subtree_com["trunk"])
+    # What the actuators are told is the filtered action, which the state remembers.
+    np.testing.assert_array_equal(
+        data.ctrl, np.tile([0.0, 0.67, -1.33], 4) + state.filter[0, 24:36]
+    )
+
+
+def test_the_rockets_state_is_that_of_the_physics() -> None:
+    env, state = after_five_steps("rocket_obstacles")
+    data = env.physics.data
+    np.testing.assert_array_equal(state.position[0], data.qpos[:2])
+    np.testing.assert_array_equal(state.velocity[0], data.qvel[:2])
+    before = data.sensordata.copy()
+    env.physics.forward()
+    np.testing.assert_array_equal(data.sensordata, before)
+    np.testing.assert_array_equal(state.clearance[0], before)
 
 
 def test_an_episode_along_the_reference_is_shorter(

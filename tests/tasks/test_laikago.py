@@ -12,6 +12,7 @@ import pytest
 from scipy.signal import butter, freqz, lfilter
 from scipy.spatial.transform import Rotation
 
+import tsbench
 from tsbench import TsbenchError, rotations, tasks
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.sim.batched import Physics
@@ -19,6 +20,7 @@ from tsbench.sim.model import compiled
 from tsbench.state import Start
 from tsbench.tasks import laikago
 from tsbench.tasks.laikago import Laikago, LaikagoCourse, LaikagoState
+from tsbench.testing.episodes import Case, compare, ending
 
 GAITS = ("laikago_walk", "laikago_trot")
 SOLE = 0.0265  # m, from a foot's centre down
@@ -428,6 +430,30 @@ def test_measures_by_hand() -> None:
     assert np.isnan(found["time to the goal, s"]).all()  # it arrived by falling
     del sums["work"]
     assert "cost of transport" not in task.measures(first, last, both, sums, np.array([60, 60]))
+
+
+VARIANTS: tuple[tsbench.Variant | None, ...] = (None, *tsbench.VARIANTS)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("name", GAITS)
+def test_both_endings_happen(name: str, variant: tsbench.Variant | None) -> None:
+    """Who stands still lasts to the horizon; folded legs fall, and a plan may stray."""
+    environment = Case(name, variant).load(seed=3, perturbed=False)
+    if variant == "planning":
+        still, away = np.zeros(7), -np.ones(7)
+    else:
+        still, away = np.zeros(12), np.where(np.arange(12) % 3 == 1, 1.0, -1.0)
+    # An imitation begins anywhere along its reference.
+    assert not all(ending(environment, lambda: still) for _ in range(20))
+    assert any(ending(environment, lambda: away) for _ in range(20))
+
+
+@pytest.mark.parametrize("name", GAITS)
+def test_both_simulations_agree_to_the_horizon(name: str) -> None:
+    task = make(name)
+    starts = task.start(np.random.default_rng(11), 3, perturbed=True)
+    assert compare(task, starts, np.zeros((task.horizon, 3, 12))) == [task.horizon] * 3
 
 
 # Action and filter

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,12 +12,14 @@ import mujoco
 import numpy as np
 import pytest
 
+import tsbench
 from tsbench import TsbenchError, tasks
 from tsbench.motion import Plan, ReferenceMotion
 from tsbench.planning.path import Path
 from tsbench.sim.batched import Physics
 from tsbench.state import Course, Start
 from tsbench.tasks.rocket import Rocket, RocketState
+from tsbench.testing.episodes import Case, compare, ending
 
 COS30, SIN30 = 0.8660254037844387, 0.5
 GOAL = np.array([51.96152422706632, 30.0])  # 60 m at 30 degrees
@@ -238,6 +241,34 @@ def test_success(distance: float, speed: float, solved: bool) -> None:
         course = Course(violated=np.array([violated]))
         assert rocket().success(at, course).tolist() == [solved and not violated]
     assert rocket().goal_distance(at)[0] == pytest.approx(distance)
+
+
+VARIANTS: tuple[tsbench.Variant | None, ...] = (None, *tsbench.VARIANTS)
+NAMES = ("rocket_navigation", "rocket_obstacles")
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("name", NAMES)
+def test_both_endings_happen(name: str, variant: tsbench.Variant | None) -> None:
+    """Who hovers lasts to the horizon, who falls leaves the world; in a plan, who stands still
+    and who flies down."""
+    environment = Case(name, variant).load(seed=3, perturbed=False)
+    if variant == "planning":
+        hover, away = itertools.cycle([np.zeros(3)]), -np.ones(3)
+    else:  # the least thrust at every other step is its weight, 12.5 N
+        hover, away = itertools.cycle([np.zeros(2), np.array([0.5, 0.0])]), np.zeros(2)
+    # An imitation begins anywhere along its reference.
+    assert not all(ending(environment, lambda: next(hover)) for _ in range(20))
+    assert any(ending(environment, lambda: away) for _ in range(20))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_both_simulations_agree_to_the_horizon(name: str) -> None:
+    task = rocket(name)
+    actions = np.zeros((task.horizon, 3, 2))
+    actions[::2, :, 0] = 0.5
+    starts = task.start(np.random.default_rng(11), 3)
+    assert compare(task, starts, actions) == [task.horizon] * 3
 
 
 # Physics

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_info
 
+from tsbench import tasks
 from tsbench.adapters import ForeignPolicy
 from tsbench.evaluation.protocol import Protocol
 from tsbench.policy import Policy
@@ -34,7 +35,7 @@ class Origin:
         model: hash of what mujoco compiled it to.
         constants: sha256 of the values that define the task (`Task.constants`).
         policy: sha256 of the policy file, or None where there is none.
-        packages: versions, Python's too.
+        packages: versions, Python's and that of the package that brings the task too.
         machine: what chooses kernels: architecture, vector extensions, BLAS, C library.
     """
 
@@ -52,6 +53,8 @@ class Origin:
     def here(cls, task: Task[Any], protocol: Protocol, policy: PolicyFunction) -> Origin:
         """Of a score that is made now, here."""
         spec = task.spec()
+        provider = tasks.provider(task.name)
+        plugin = {} if provider is None else {provider.distribution: provider.version}
         return cls(
             protocol=protocol,
             task=task.name,
@@ -61,7 +64,8 @@ class Origin:
             constants=constants_hash(task),
             policy=policy.sha256 if isinstance(policy, (Policy, ForeignPolicy)) else None,
             packages={"python": platform.python_version()}
-            | {name: version(name) for name in PACKAGES},
+            | {name: version(name) for name in PACKAGES}
+            | plugin,
             machine=machine(),
         )
 

@@ -1,6 +1,8 @@
 """Scores to hold others against: doing nothing, doing anything, and the best motion known.
 
-`references.json` keeps them. `python -m tsbench.evaluation.references` makes it again.
+The package that brings a task may keep them, in `references/TASK.json`.
+`python -m tsbench.evaluation.references TASK ...` makes such files, for all tasks where none is
+named.
 """
 
 from __future__ import annotations
@@ -8,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ import numpy as np
 
 from tsbench import tasks
 from tsbench.adapters import ForeignPolicy, from_function
+from tsbench.errors import unknown
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import constants_hash
@@ -23,7 +26,6 @@ from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.score import Score
 from tsbench.task import MDP, Task
 
-FILE = Path(__file__).with_name("references.json")
 ROBUSTNESS = ("survival_100N", "recovery_100N", "survival_impulse_50", "recovery_impulse_50")
 DECIMALS = 6  # of an observation that the random policy tells apart
 
@@ -85,16 +87,37 @@ def row(score: Score) -> dict[str, Any]:
     }
 
 
-def stored(task: str) -> dict[str, Any]:
-    """What `rows` gave for a task, from the file."""
-    content: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))[task]
-    return content
+def stored(task: str) -> dict[str, Any] | None:
+    """What `rows` gave for a task, from its file; None where there is none.
+
+    Raises:
+        TsbenchError: no such task.
+    """
+    path = _file(task)
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def _file(task: str) -> Path:
+    provider = tasks.provider(task)
+    if provider is None:
+        raise unknown("task", task, tasks.names())
+    return Path(str(provider.folder() / "references" / f"{task}.json"))
+
+
+def main(names: Sequence[str]) -> None:
+    """Makes the files of some tasks again."""
+    for name in names:
+        content = json.dumps(rows(tasks.make(name)), indent=2) + "\n"
+        path = _file(name)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(content, encoding="utf-8")
+        sys.stdout.write(f"{path}\n")
 
 
 def beside(score: Score) -> dict[str, dict[str, Any]]:
     """The rows of the reference policies, by name, that a score can be read beside: of the same
     task by the same protocol. None for a task that has none, or has other constants here."""
-    content = json.loads(FILE.read_text(encoding="utf-8")).get(score.origin.task, {})
+    content = (stored(score.origin.task) if score.origin.task in tasks.names() else None) or {}
     if (score.protocol, score.origin.constants) != (
         content.get("protocol"), content.get("constants"),
     ):  # fmt: skip
@@ -103,6 +126,4 @@ def beside(score: Score) -> dict[str, dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    made = {name: rows(tasks.make(name)) for name in tasks.names()}
-    FILE.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")
-    sys.stdout.write(f"{FILE}\n")
+    main(sys.argv[1:] or tasks.names())

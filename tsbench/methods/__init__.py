@@ -1,25 +1,30 @@
 """The methods. A new one is one file here and one config in conf/method/.
 
 `tsbench.methods.NAME` has a dataclass `Options` and a function
-`train(problem, workspace) -> Policy`; with PPO stages it names their kinds in `STAGES`.
+`train(problem, workspace) -> Policy`; with PPO stages it names their kinds in `STAGES`. Both files
+may also lie in another package (see `tsbench.plugins`).
 """
 
 from __future__ import annotations
 
 import ast
-import importlib
 import pkgutil
-from pathlib import Path
+from contextlib import suppress
+from functools import cache
+from importlib.abc import InspectLoader
+from importlib.util import find_spec
 from typing import Any, Protocol, cast
 
+from tsbench import plugins
 from tsbench.errors import TsbenchError, unknown
+from tsbench.plugins import Plugin, Provider
 from tsbench.policy import Policy
 from tsbench.problem import Problem, Workspace
 from tsbench.typed import typed
 
 
 class Method(Protocol):
-    """A module of this package.
+    """The module of a method.
 
     Attributes:
         Options: dataclass of what the method's config holds beside its name, with defaults.
@@ -36,25 +41,46 @@ class Method(Protocol):
 
 
 def names() -> tuple[str, ...]:
-    """All methods, sorted: the modules of this package. Imports none of them."""
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
+    """All methods that can be used, sorted: tsbench's own and those of plug-ins. Imports none."""
+    return tuple(sorted(name for name, offers in _found()[0].items() if len(offers) == 1))
+
+
+def refused() -> tuple[str, ...]:
+    """A line for each plug-in that cannot be imported, and for each name that several bring."""
+    found, broken = _found()
+    several = [_ambiguous(name) for name, offers in found.items() if len(offers) > 1]
+    return (*broken, *sorted(map(str, several)))
+
+
+def provider(name: str) -> Provider:
+    """The package that brings a method.
+
+    Raises:
+        TsbenchError: no such method.
+    """
+    return _plugin(name).provider
 
 
 def summary(name: str) -> str:
-    """The first line of the method's file, which says what it does. Imports nothing."""
-    source = (Path(__path__[0]) / f"{name}.py").read_text(encoding="utf-8")
-    return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
+    """The first line of the method's file, which says what it does. Does not import it.
+
+    Raises:
+        TsbenchError: no such method.
+    """
+    module = _plugin(name).module
+    spec = find_spec(module)
+    loader = spec.loader if spec else None
+    source = loader.get_source(module) if isinstance(loader, InspectLoader) else None
+    return (ast.get_docstring(ast.parse(source or "")) or "").partition("\n")[0]
 
 
 def find(name: str) -> Method:
     """The method of that name.
 
     Raises:
-        TsbenchError: there is none, or it lacks a part.
+        TsbenchError: there is none, it cannot be imported, or it lacks a part.
     """
-    if name not in names():
-        raise unknown("method", name, names())
-    module = importlib.import_module(f"{__name__}.{name}")
+    module = _plugin(name).load()
     for part in ("Options", "train"):
         if not hasattr(module, part):
             raise TsbenchError(f"the method {name} has no {part} (see tsbench.methods.Method)")
@@ -71,6 +97,15 @@ def stages(name: str) -> tuple[str, ...]:
     return tuple(getattr(find(name), "STAGES", ()))
 
 
+def all_stages() -> set[str]:
+    """The kinds of PPO stages of all methods but those that cannot be imported."""
+    kinds: set[str] = set()
+    for name in names():
+        with suppress(TsbenchError):
+            kinds.update(stages(name))
+    return kinds
+
+
 def options(kind: type[Any], problem: Problem) -> Any:
     """The method's options as an instance of its dataclass `kind`.
 
@@ -79,3 +114,37 @@ def options(kind: type[Any], problem: Problem) -> Any:
     """
     given = {key: value for key, value in problem.options.items() if key != "name"}
     return typed(kind, given, "method")
+
+
+@cache
+def _found() -> tuple[dict[str, dict[str, Plugin]], tuple[str, ...]]:
+    """Where methods are: by name and by the package that brings each. And a line for each plug-in
+    that cannot be imported."""
+    own = [
+        Plugin(module.name, f"{__name__}.{module.name}", plugins.own())
+        for module in pkgutil.iter_modules(__path__)
+    ]
+    found: dict[str, dict[str, Plugin]] = {}
+    broken: list[str] = []
+    for plugin in (*own, *plugins.plugins(plugins.METHODS)):
+        try:
+            plugin.find()
+        except TsbenchError as error:
+            broken.append(str(error))
+        else:
+            found.setdefault(plugin.name, {})[plugin.provider.package] = plugin
+    return found, tuple(dict.fromkeys(broken))
+
+
+def _plugin(name: str) -> Plugin:
+    found, broken = _found()
+    offers = found.get(name, {})
+    if len(offers) > 1:
+        raise _ambiguous(name)
+    if not offers:
+        raise unknown("method", name, names(), broken)
+    return next(iter(offers.values()))
+
+
+def _ambiguous(name: str) -> TsbenchError:
+    return plugins.ambiguous("method", name, _found()[0][name])

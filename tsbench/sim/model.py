@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import re
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from tsbench.errors import TsbenchError
+from tsbench.plugins import OWN, walk
 
 # A wheel ships models/ inside the package; a checkout has it beside the package.
 _FOLDERS = (
@@ -32,7 +34,7 @@ UNSTABLE = [
 
 
 def model_path(name: str) -> Path:
-    """The hand-written MJCF of that name.
+    """The hand-written MJCF of tsbench's own of that name.
 
     Raises:
         TsbenchError: the installation lacks it.
@@ -44,15 +46,31 @@ def model_path(name: str) -> Path:
     raise TsbenchError(f"the installation lacks models/{name}.xml: install tsbench again")
 
 
-def load_spec(name: str) -> mujoco.MjSpec:
-    """The MJCF of that name, open to additions."""
-    return mujoco.MjSpec.from_file(str(model_path(name)))
+def load_spec(name: str, package: str = OWN) -> mujoco.MjSpec:
+    """A MJCF, open to additions.
+
+    Args:
+        name: of the file `models/NAME.xml`.
+        package: that has the file, or a module in it. Meshes, textures and included files lie in
+            the same folder or below. They are handed over in memory: from a file, mujoco would
+            compile the folder's absolute path into the model.
+
+    Raises:
+        TsbenchError: there is no such file.
+    """
+    package = package.partition(".")[0]
+    if package == OWN:
+        return mujoco.MjSpec.from_file(str(model_path(name)))
+    content = {path: file.read_bytes() for path, file in walk(files(package) / "models")}
+    if (main := f"{name}.xml") not in content:
+        raise TsbenchError(f"the package {package} lacks models/{main}")
+    return mujoco.MjSpec.from_string(content[main].decode(), include=content, assets=content)
 
 
 @cache
-def compiled(name: str) -> mujoco.MjModel:
-    """The MJCF of that name as it is; for reading only."""
-    model: mujoco.MjModel = load_spec(name).compile()
+def compiled(name: str, package: str = OWN) -> mujoco.MjModel:
+    """A MJCF (see `load_spec`) as it is; for reading only."""
+    model: mujoco.MjModel = load_spec(name, package).compile()
     return model
 
 

@@ -1,4 +1,7 @@
-"""The tasks. A new one is one file here, one MJCF in models/ and one config in conf/task/."""
+"""The tasks. A new one is one file here, one MJCF in models/ and one config in conf/task/.
+
+All of them may also lie in another package (see `tsbench.plugins`).
+"""
 
 from __future__ import annotations
 
@@ -9,32 +12,61 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+from tsbench import plugins
 from tsbench.errors import TsbenchError, unknown
+from tsbench.plugins import Provider
 from tsbench.task import Task
 
 Factory = Callable[..., Task[Any]]
 
-_factories: dict[str, Factory] = {}
+_factories: dict[str, dict[str, Factory]] = {}  # by name and by the package that brings it
 
 
 def register(name: str) -> Callable[[Factory], Factory]:
     """Adds a task: a function of its constants, all with defaults, that returns the task."""
 
     def add(factory: Factory) -> Factory:
-        if name in _factories:
+        package = factory.__module__.partition(".")[0]
+        offers = _factories.setdefault(name, {})
+        if package in offers:
             raise ValueError(f"the task {name!r} is registered already")
-        _factories[name] = factory
+        offers[package] = factory
         return factory
 
     return add
 
 
-@cache
 def names() -> tuple[str, ...]:
-    """All tasks, sorted."""
-    for module in pkgutil.iter_modules(__path__):
-        importlib.import_module(f"{__name__}.{module.name}")
-    return tuple(sorted(_factories))
+    """All tasks that can be made, sorted: tsbench's own and those of plug-ins."""
+    return tuple(sorted(name for name, offers in _offers().items() if len(offers) == 1))
+
+
+def refused() -> tuple[str, ...]:
+    """A line for each plug-in that cannot be imported, and for each name that several bring."""
+    several = [_ambiguous(name) for name, offers in _offers().items() if len(offers) > 1]
+    return (*_broken().values(), *sorted(map(str, several)))
+
+
+def provider(name: str) -> Provider | None:
+    """The installed package that brings a task; None for a task that no installed package does.
+
+    Raises:
+        TsbenchError: several do.
+    """
+    offers = _offers().get(name, {})
+    if len(offers) > 1:
+        raise _ambiguous(name)
+    return next((one for one in plugins.providers() if one.package in offers), None)
+
+
+def defaults(name: str) -> dict[str, Any]:
+    """The constants that `make` takes for a task, with their standard values.
+
+    Raises:
+        TsbenchError: no such task.
+    """
+    parameters = inspect.signature(_factory(name)).parameters
+    return {constant: parameter.default for constant, parameter in parameters.items()}
 
 
 def make(name: str, **constants: Any) -> Task[Any]:
@@ -43,9 +75,8 @@ def make(name: str, **constants: Any) -> Task[Any]:
     Raises:
         TsbenchError: no such task or constant.
     """
-    if name not in names():
-        raise unknown("task", name, names())
-    allowed = inspect.signature(_factories[name]).parameters
+    factory = _factory(name)
+    allowed = inspect.signature(factory).parameters
     for constant, value in constants.items():
         if constant not in allowed:
             raise unknown(f"constant of {name}", constant, allowed)
@@ -53,7 +84,7 @@ def make(name: str, **constants: Any) -> Task[Any]:
         if number and (isinstance(value, bool) or not isinstance(value, (int, float))):
             raise TsbenchError(f"{constant} of {name} must be a number, not {value!r}")
     try:
-        return _factories[name](**constants)
+        return factory(**constants)
     except (TypeError, ValueError, OverflowError) as error:
         raise TsbenchError(f"{name} cannot be made with {constants}: {error}") from None
 
@@ -61,3 +92,40 @@ def make(name: str, **constants: Any) -> Task[Any]:
 def standard(task: Task[Any]) -> bool:
     """Whether the task has the constants that scores are ranked by."""
     return task.constants() == make(task.name).constants()
+
+
+def _factory(name: str) -> Factory:
+    offers = _offers().get(name, {})
+    if len(offers) > 1:
+        raise _ambiguous(name)
+    if not offers:
+        raise unknown("task", name, names(), _broken().values())
+    return next(iter(offers.values()))
+
+
+def _offers() -> dict[str, dict[str, Factory]]:
+    """What is registered, without what comes from a package that cannot be imported whole."""
+    broken = _broken()
+    return {
+        name: {package: make for package, make in offers.items() if package not in broken}
+        for name, offers in _factories.items()
+    }
+
+
+@cache
+def _broken() -> dict[str, str]:
+    """Imports all tasks. Gives, for each package where that fails, a line that says why."""
+    for module in pkgutil.iter_modules(__path__):
+        importlib.import_module(f"{__name__}.{module.name}")
+    broken = {}
+    for plugin in plugins.plugins(plugins.TASKS):
+        try:
+            plugin.find()
+            plugin.load()
+        except TsbenchError as error:
+            broken[plugin.provider.package] = str(error)
+    return broken
+
+
+def _ambiguous(name: str) -> TsbenchError:
+    return plugins.ambiguous("task", name, _offers()[name])

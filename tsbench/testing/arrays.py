@@ -1,4 +1,4 @@
-"""Every function of every task on arrays of another library, data type and device.
+"""Every function of a task on arrays of another library, data type and device.
 
 On float32 tensors of torch each gives float32, within 1e-4 of what float64 arrays of numpy give. On
 torch's meta device, whose tensors have no values, each runs to its end: nothing moves to the host.
@@ -7,8 +7,9 @@ torch's meta device, whose tensors have no values, each runs to its end: nothing
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import sensor_slices
 from tsbench.state import Batch, Readings
 from tsbench.task import Plannable, Task
+from tsbench.testing.episodes import reference_of
 
 COUNT = 48
 STEPS = 20
@@ -139,44 +141,50 @@ def _readings(physics: Physics[Any], task: Task[Any], state: Any) -> Readings:
     return found
 
 
-@pytest.fixture(scope="module", params=tasks.names())
-def all_calls(
-    request: pytest.FixtureRequest, naive_reference: Callable[[str], ReferenceMotion]
-) -> list[Call]:
-    task = tasks.make(request.param)
-    reference = naive_reference(request.param) if isinstance(task, Plannable) else None
-    return list(calls(task, reference))
+@cache
+def all_calls(name: str) -> list[Call]:
+    task = tasks.make(name)
+    return list(calls(task, reference_of(name) if isinstance(task, Plannable) else None))
 
 
-def test_torch_in_single_precision_agrees(all_calls: list[Call]) -> None:
-    for name, function, arguments in all_calls:
-        expected = dict(leaves(function(*arguments)))
-        found = dict(leaves(function(*(converted(argument, tensor) for argument in arguments))))
-        assert found.keys() == expected.keys(), name
-        for path, values in found.items():
-            wanted = np.asarray(expected[path])
-            assert isinstance(values, torch.Tensor), (name, path)
-            kinds = {torch.float32} if wanted.dtype.kind == "f" else {torch.bool, torch.int64}
-            assert values.dtype in kinds, (name, path)
-            assert tuple(values.shape) == wanted.shape, (name, path)
-            np.testing.assert_allclose(
-                values.numpy(), wanted, rtol=1e-4, atol=1e-4, err_msg=f"{name}{path}"
-            )
+class ArrayContract:
+    """Attributes:
+    names: of the tasks that the contract is for.
+    """
 
+    names: ClassVar[Sequence[str]] = ()
 
-def test_nothing_moves_to_the_host(all_calls: list[Call]) -> None:
-    for name, function, arguments in all_calls:
-        found = dict(leaves(function(*(converted(argument, meta) for argument in arguments))))
-        for path, values in found.items():
-            assert values.device.type == "meta", (name, path)
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """Runs each test for each task."""
+        metafunc.parametrize("name", self.names)
 
+    def test_torch_in_single_precision_agrees(self, name: str) -> None:
+        for call, function, arguments in all_calls(name):
+            expected = dict(leaves(function(*arguments)))
+            found = dict(leaves(function(*(converted(argument, tensor) for argument in arguments))))
+            assert found.keys() == expected.keys(), call
+            for path, values in found.items():
+                wanted = np.asarray(expected[path])
+                assert isinstance(values, torch.Tensor), (call, path)
+                kinds = {torch.float32} if wanted.dtype.kind == "f" else {torch.bool, torch.int64}
+                assert values.dtype in kinds, (call, path)
+                assert tuple(values.shape) == wanted.shape, (call, path)
+                np.testing.assert_allclose(
+                    values.numpy(), wanted, rtol=1e-4, atol=1e-4, err_msg=f"{call}{path}"
+                )
 
-def test_states_are_merged_and_taken_apart(all_calls: list[Call]) -> None:
-    state = next(args[0] for name, _, args in all_calls if name == "task.observation")
-    rows = np.array([1, 4])
-    other = state.rows(rows).replace(time=np.array([7.0, 8.0]))
-    for convert in (single, tensor):
-        at = convert(rows)
-        merged = converted(state, convert).updated(at, converted(other, convert))
-        assert merged.time.tolist()[:5] == [state.time[0], 7.0, *state.time[2:4], 8.0]
-        assert merged.rows(at).time.tolist() == [7.0, 8.0]
+    def test_nothing_moves_to_the_host(self, name: str) -> None:
+        for call, function, arguments in all_calls(name):
+            found = dict(leaves(function(*(converted(argument, meta) for argument in arguments))))
+            for path, values in found.items():
+                assert values.device.type == "meta", (call, path)
+
+    def test_states_are_merged_and_taken_apart(self, name: str) -> None:
+        state = next(args[0] for call, _, args in all_calls(name) if call == "task.observation")
+        rows = np.array([1, 4])
+        other = state.rows(rows).replace(time=np.array([7.0, 8.0]))
+        for convert in (single, tensor):
+            at = convert(rows)
+            merged = converted(state, convert).updated(at, converted(other, convert))
+            assert merged.time.tolist()[:5] == [state.time[0], 7.0, *state.time[2:4], 8.0]
+            assert merged.rows(at).time.tolist() == [7.0, 8.0]
