@@ -264,6 +264,7 @@ def _evaluate(words: Sequence[str]) -> int:
     from tsbench.evaluation.protocol import PROTOCOLS, V1
     from tsbench.evaluation.replay import compare
     from tsbench.files import write_json
+    from tsbench.progress import progress_bar
 
     path = Path(options.policy)
     policy, task = _policy(path, options.task, options.trust_sb3)
@@ -277,7 +278,7 @@ def _evaluate(words: Sequence[str]) -> int:
     if options.keep is not None:
         record.check_keep(run, options.keep, protocol)
     console, standard = Console(), tasks.standard(task)
-    with tables.progress(console, "evaluate") as progress:
+    with progress_bar(console, "evaluate") as progress:
         score = evaluate(
             policy, task, protocol=protocol, threads=options.threads, progress=progress
         )

@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from tsbench import methods, plugins, tables, tasks
+from tsbench import methods, plugins, tasks
 from tsbench.config import RunConfig
 from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.evaluation.evaluate import evaluate
@@ -31,6 +31,7 @@ from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
 from tsbench.files import PART, taken, write_json, write_whole
 from tsbench.problem import Problem
+from tsbench.progress import progress_bar
 from tsbench.record import Record, RunDirectory
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
@@ -173,7 +174,6 @@ def _work(
         workspace.note(line)
         record = _train(config, problem, workspace, console)
         write_json(run.score_file, record.as_dict())  # last: it says that the run is finished
-    tables.show_run(console, record)
     shutil.rmtree(run.checkpoints, ignore_errors=True)
     return record.score
 
@@ -244,7 +244,7 @@ def _train(
     policy = methods.find(config.method["name"]).train(problem, workspace)
     policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
-    with tables.progress(console, "evaluate") as progress:
+    with progress_bar(console, "evaluate") as progress:
         score = evaluate(
             policy, problem.task, protocol=protocol, threads=problem.threads, progress=progress
         )

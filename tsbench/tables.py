@@ -2,44 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
-
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
-from tsbench.evaluation.score import Score, Summary
+from tsbench.evaluation.score import Score
+from tsbench.evaluation.words import claim_force
 from tsbench.record import Record, RunDirectory
-
-
-def duration(seconds: float) -> str:
-    """h:mm:ss, or m:ss below an hour."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-def number(value: Any) -> str:
-    """Four digits of a fraction; a dash for what is not known."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-@contextmanager
-def progress(console: Console, what: str) -> Iterator[Callable[[float], None]]:
-    """A bar that takes shares from 0 to 1, on a terminal; elsewhere it shows nothing."""
-    columns = (TextColumn("{task.description:<10}"), BarColumn(), TaskProgressColumn())
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        row = bar.add_task(what, total=1.0)
-        yield lambda share: bar.update(row, completed=share)
+from tsbench.words import duration, number
 
 
 def score_table(title: str, score: Score) -> Table:
@@ -77,7 +48,7 @@ def score_table(title: str, score: Score) -> Table:
 
 def show_run(console: Console, record: Record) -> None:
     """Prints what ends a run: its score and what each stage cost."""
-    table = score_table(run_title(record), record.score)
+    table = score_table(record.title, record.score)
     table.add_section()
     table.add_row("stage", "steps", "time", style="bold")
     for stage in record.stages:
@@ -102,40 +73,3 @@ def show_rank(console: Console, standard: bool, score: Score) -> None:
         reasons.append(f"protocol {score.protocol} asks too little")
     if reasons:
         console.print(f" not to be ranked: {' and '.join(reasons)}", highlight=False)
-
-
-def run_title(record: Record) -> str:
-    return f"{record.task}, {record.method}, seed {record.seed}, budget {record.budget}"
-
-
-def summary(score: Score) -> list[tuple[str, str]]:
-    """Labels and values of a score in short, in words that need no explanation."""
-    perturbed = score.perturbed
-    solved, spoiled = counts(perturbed)
-    return [
-        ("of the largest possible reward", f"{score.normalized_reward:.1%}"),
-        ("of the best motion at the planner's speed", f"{score.optimality:.1%}"),
-        ("solved from other starts", f"{solved} of {perturbed.episodes}"),
-        ("falls and collisions there", f"{spoiled} of {perturbed.episodes}"),
-        *pushes(score),
-    ]
-
-
-def pushes(score: Score) -> list[tuple[str, str]]:
-    """Labels and values of its robustness in short."""
-    robustness = score.robustness
-    bound = "over " if robustness.impulse_50_is_lower_bound else ""
-    return [
-        (f"pushes of {claim_force(score):.3g} N survived", f"{robustness.survival_100N:.0%}"),
-        ("impulse that half survive", f"{bound}{number(robustness.impulse_50)} N s"),
-    ]
-
-
-def claim_force(score: Score) -> float:
-    """Newtons of the pushes of `survival_100N` on this task's body."""
-    return score.origin.protocol.claim * score.robustness.mass_scale
-
-
-def counts(summary: Summary) -> tuple[int, int]:
-    """Episodes solved, and spoiled on the way."""
-    return round(summary.success * summary.episodes), round(summary.violations * summary.episodes)

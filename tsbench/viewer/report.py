@@ -11,9 +11,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from tsbench import curves, tables
+from tsbench import curves
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.score import Score
+from tsbench.evaluation.words import counts, pushes
 from tsbench.files import write_new
 from tsbench.record import RunDirectory
 from tsbench.task import plannable
@@ -22,6 +23,7 @@ from tsbench.viewer.compose import foot_bands
 from tsbench.viewer.recording import Recording, record_episode
 from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR
 from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words, run_subject
+from tsbench.words import duration, number
 
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
 
@@ -100,7 +102,7 @@ def _answers(score: Score, recording: Recording, plan: Recording | None) -> Iter
 
 
 def _worth_in_words(score: Score) -> str:
-    solved, spoiled = tables.counts(score.perturbed)
+    solved, spoiled = counts(score.perturbed)
     return (
         f"It earns {score.optimality:.0%} of the reward of the best motion known under the "
         f"planner's speed limits. From {score.perturbed.episodes} starts a little different from "
@@ -166,7 +168,7 @@ def _tables(subject: Subject, run: RunDirectory) -> Iterator[str]:
     yield _table(_score_rows(subject.score.score))
     costs = [
         (stage.name, f"{stage.steps:,}", f"{stage.physics_substeps:,}",
-         tables.duration(stage.seconds))
+         duration(stage.seconds))
         for stage in subject.score.stages
     ]  # fmt: skip
     yield _table([("stage", "environment steps", "physics steps", "time"), *costs])
@@ -187,9 +189,9 @@ def _score_rows(score: Score) -> Table:
     for name in own:
         if name != "episodes":
             label = name.replace("_", " ") + (", m" if name == "goal_distance" else "")
-            rows.append((label, tables.number(own[name]), tables.number(perturbed[name])))
-    rows.append(("optimality", tables.number(score.optimality), ""))
-    rows += [(label, value, "") for label, value in tables.pushes(score)]
+            rows.append((label, number(own[name]), number(perturbed[name])))
+    rows.append(("optimality", number(score.optimality), ""))
+    rows += [(label, value, "") for label, value in pushes(score)]
     return rows
 
 
