@@ -49,7 +49,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "bench": {*CORE, "sim", "tasks", "rl", "methods", "config", "record", "workspace", "run"},
 }  # fmt: skip
 # The commands and the public faces: they may know everything.
-ROOFS = {"cli", "gym", "testing", "tsbench"}
+ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 
 ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl", "testing"},

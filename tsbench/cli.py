@@ -445,7 +445,3 @@ VERBS = {
     "bench": Verb("measure how fast it is, side by side with others", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }
-
-
-if __name__ == "__main__":
-    sys.exit(main())

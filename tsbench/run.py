@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from tsbench.sim.model import compiled_hash
 from tsbench.typed import unknown_key
 from tsbench.workspace import RunWorkspace
 
+PACKAGE = Path(str(files("tsbench")))
 # What can change a number in a run.
 PACKAGES = (
     "dm-control",
@@ -309,7 +311,7 @@ def _write_provenance(
 def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     """All that decides what a run gives, to the last bit, on one kind of machine."""
     code = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(PACKAGE.rglob("*.py")):
         code.update(path.read_bytes())
     configuration = json.dumps(config.identity, sort_keys=True)
     brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
@@ -349,8 +351,8 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that this file lies in, with "+" when it has been changed."""
-    root = Path(__file__).parents[1]
+    """The commit of the checkout that tsbench lies in, with "+" when it has been changed."""
+    root = PACKAGE.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
         return None
     git = ["git", "-C", str(root)]
