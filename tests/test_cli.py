@@ -208,7 +208,7 @@ def test_shell_completion(
 def test_output_to_a_full_disk() -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "tsbench.cli"], stdout=full, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "tsbench"], stdout=full, stderr=subprocess.PIPE, text=True
         )
     assert (done.returncode, done.stderr) == (2, "tsbench: output: No space left on device\n")
 
@@ -216,7 +216,7 @@ def test_output_to_a_full_disk() -> None:
 def test_graphics_that_do_not_exist() -> None:
     """MUJOCO_GL is read when mujoco is imported."""
     done = subprocess.run(
-        [sys.executable, "-m", "tsbench.cli", "list"],
+        [sys.executable, "-m", "tsbench", "list"],
         env={**os.environ, "MUJOCO_GL": "crayons"},
         capture_output=True,
         text=True,
@@ -229,7 +229,7 @@ def test_graphics_that_do_not_exist() -> None:
 def test_interrupted(tmp_path: Path) -> None:
     words = ["run", TASK, "directory=mine"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "tsbench.cli", *words],
+        [sys.executable, "-m", "tsbench", *words],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -14,9 +14,10 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsbench import config, run, tables, tasks
+from tsbench import config, run, tasks
 from tsbench.checkpoint import Checkpoints
 from tsbench.errors import TsbenchError
+from tsbench.evaluation import words
 from tsbench.evaluation.evaluate import check_fit
 from tsbench.files import write_json
 from tsbench.motion import Plan, ReferenceMotion
@@ -98,8 +99,8 @@ def intact(
 
 def read_score(folder: Path) -> None:
     content = RunDirectory(folder).record()
-    assert tables.run_title(content)
-    assert tables.summary(content.score, tasks.make(content.task))
+    assert content.title
+    assert words.summary(content.score, tasks.make(content.task))
 
 
 def read_policy(folder: Path) -> None:

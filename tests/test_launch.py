@@ -55,7 +55,7 @@ def test_jobs_in_another_process(tmp_path: Path) -> None:
     (tmp_path / places[0] / "notes.txt").touch()
     path = os.pathsep.join([str(plugins), *sys.path])
     done = subprocess.run(
-        [sys.executable, "-m", "tsbench.cli", "run", "-m", "hydra/launcher=elsewhere", *WORDS],
+        [sys.executable, "-m", "tsbench", "run", "-m", "hydra/launcher=elsewhere", *WORDS],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,

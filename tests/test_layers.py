@@ -18,8 +18,8 @@ ROOT = Path(tsbench.__file__).parent
 # What each room may know, lowest first; a room is a package or a file beside the packages.
 # What everyone may know, beside what stands before it in this list.
 CORE = (
-    "errors", "typed", "files", "plugins", "arrays", "constants", "rotations", "drawing", "state",
-    "motion", "policy", "task", "problem",
+    "errors", "typed", "words", "files", "plugins", "arrays", "constants", "rotations", "drawing",
+    "state", "motion", "policy", "task", "problem",
 )  # fmt: skip
 MAY_KNOW: dict[str, set[str]] = {
     **{module: set(CORE[:number]) for number, module in enumerate(CORE)},
@@ -35,20 +35,21 @@ MAY_KNOW: dict[str, set[str]] = {
     "evaluation": {*CORE, "adapters", "sim", "tasks"},
     "rl": {*CORE, "sim"},
     "methods": {*CORE, "sim", "planning", "rl"},
-    "viewer": {*CORE, "sim", "tasks", "evaluation", "record", "tables", "curves"},
+    "viewer": {*CORE, "sim", "tasks", "evaluation", "record", "curves"},
     "config": {*CORE},
     "record": {*CORE, "tasks", "evaluation", "config"},
-    "tables": {"task", "evaluation", "record"},
-    "workspace": {*CORE, "checkpoint", "events", "record", "tables"},
+    "progress": set(),
+    "tables": {*CORE, "evaluation", "record"},
+    "workspace": {*CORE, "checkpoint", "events", "record"},
     "run": {
-        *CORE, "sim", "tasks", "evaluation", "rl", "methods", "config", "record", "tables",
-        "workspace",
+        *CORE, "sim", "tasks", "evaluation", "rl", "methods", "config", "record",
+        "progress", "workspace",
     },
     "launch": {*CORE, "config", "record", "tables", "viewer", "run"},
     "bench": {*CORE, "sim", "tasks", "rl", "methods", "config", "record", "workspace", "run"},
 }  # fmt: skip
 # The commands and the public faces: they may know everything.
-ROOFS = {"cli", "gym", "testing", "tsbench"}
+ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 
 ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl", "testing"},
@@ -67,7 +68,7 @@ ONLY_IN: dict[str, set[str]] = {
     "matplotlib": {"curves", "viewer"},
     "pytest": {"testing"},
     "tensorboard": {"events"},
-    "rich": {"tables", "workspace", "run", "cli", "launch", "bench"},
+    "rich": {"tables", "progress", "workspace", "run", "cli", "launch", "bench"},
 }
 STARTS_FAST = {"tsbench", "cli", "launch"}  # where an import may wait until it is needed
 

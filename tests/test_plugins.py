@@ -124,7 +124,7 @@ def toy(tmp_path: Path) -> Toy:
 
 def call(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Runs a command of tsbench's. See `python`."""
-    return python(folder, "-m", "tsbench.cli", *words)
+    return python(folder, "-m", "tsbench", *words)
 
 
 def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:

@@ -22,7 +22,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.util.tensor_util import make_ndarray
 
-from tsbench import cli, config, launch, record, run, tables, tasks
+from tsbench import cli, config, launch, record, run, tasks, words
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.protocol import PROTOCOLS, SMOKE
 from tsbench.motion import ActionLog, Plan, ReferenceMotion
@@ -146,7 +146,7 @@ def test_the_learning_curves_are_a_picture(shown: tuple[Path, str]) -> None:
 
 def test_the_table_tells_the_score_the_cost_and_where_to_look(shown: tuple[Path, str]) -> None:
     directory, text = shown
-    for words in (
+    for line in (
         "rocket_navigation, twostage, seed 3, budget smoke",
         "normalized_reward",
         "SOLVED",
@@ -158,7 +158,7 @@ def test_the_table_tells_the_score_the_cost_and_where_to_look(shown: tuple[Path,
         f"tsbench evaluate {directory}",
         f"{directory / 'report.html'}",
     ):
-        assert words in text
+        assert line in text
     assert "plan:" in (directory / "log.txt").read_text()
 
 
@@ -718,11 +718,11 @@ def test_mujocos_warnings_are_told(tmp_path: Path) -> None:
 
 
 def test_numbers_as_people_read_them() -> None:
-    assert tables.duration(59.6) == "1:00"
-    assert tables.duration(3725.0) == "1:02:05"
-    assert tables.number(None) == tables.number(math.inf) == "-"
-    assert tables.number(0.123456) == "0.1235"
-    assert tables.number(12) == "12"
+    assert words.duration(59.6) == "1:00"
+    assert words.duration(3725.0) == "1:02:05"
+    assert words.number(None) == words.number(math.inf) == "-"
+    assert words.number(0.123456) == "0.1235"
+    assert words.number(12) == "12"
 
 
 def test_stages_are_plain_values() -> None:

@@ -267,6 +267,8 @@ def _evaluate(words: Sequence[str]) -> int:
     from tsbench.evaluation.protocol import PHYSICS, PROTOCOLS, V1
     from tsbench.evaluation.replay import compare
     from tsbench.files import write_json
+    from tsbench.progress import progress_bar
+    from tsbench.words import number
 
     path = Path(options.policy)
     policy, task = _policy(path, options.task, options.trust_sb3)
@@ -284,7 +286,7 @@ def _evaluate(words: Sequence[str]) -> int:
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
     console, standard = Console(), tasks.standard(task)
-    with tables.progress(console, "evaluate") as progress:
+    with progress_bar(console, "evaluate") as progress:
         score = evaluate(
             policy, task, protocol=protocol, threads=options.threads, progress=progress
         )
@@ -299,7 +301,7 @@ def _evaluate(words: Sequence[str]) -> int:
         line = f" {run.score_file}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if options.physics is not None:
-        with tables.progress(console, options.physics) as progress:
+        with progress_bar(console, options.physics) as progress:
             other = evaluate(
                 policy,
                 task,
@@ -310,8 +312,8 @@ def _evaluate(words: Sequence[str]) -> int:
         flipped = flips(score, other)
         console.print(tables.flips_table(options.physics, flipped))
         console.print(
-            f" solved_reward {tables.number(other.solved_reward)} in physics {options.physics}, "
-            f"{tables.number(score.solved_reward)} certified; the first is never ranked or kept",
+            f" solved_reward {number(other.solved_reward)} in physics {options.physics}, "
+            f"{number(score.solved_reward)} certified; the first is never ranked or kept",
             highlight=False,
             soft_wrap=True,
         )
@@ -469,7 +471,3 @@ VERBS = {
     "bench": Verb("measure how fast it is, side by side with others", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }
-
-
-if __name__ == "__main__":
-    sys.exit(main())

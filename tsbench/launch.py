@@ -73,13 +73,15 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
 
 
 def finish(directory: Path, console: Console | None = None) -> None:
-    """Makes the pages that a finished run lacks, and tells where they are.
+    """Tells what came out of a finished run, makes pages that it lacks, and says where they are.
 
     Raises:
         TsbenchError: a page cannot be made. The run is finished all the same.
         Stopped: by Ctrl-C or SIGTERM.
     """
-    finished = RunDirectory(directory)
+    finished, console = RunDirectory(directory), console or Console()
+    record = finished.record()
+    tables.show_run(console, record, finished.task(record.task))
     way_on = f"; the run is finished, its pages are not: tsbench report {directory}"
     try:
         with run.signals(_stop), memory_errors():
@@ -88,7 +90,7 @@ def finish(directory: Path, console: Console | None = None) -> None:
         raise TsbenchError(f"{error}{way_on}") from error
     except Stopped as stopped:
         raise Stopped(stopped.signal, f"{stopped}{way_on}") from None
-    tables.show_places(console or Console(), finished)
+    tables.show_places(console, finished)
 
 
 def _stop(number: int) -> NoReturn:

@@ -78,6 +78,11 @@ class Record:
     score: Score
     stages: tuple[Stage, ...]
 
+    @property
+    def title(self) -> str:
+        """The run in a line."""
+        return f"{self.task}, {self.method}, seed {self.seed}, budget {self.budget}"
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
         return {**asdict(self), "score": self.score.as_dict()}

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from tsbench import methods, plugins, tables, tasks
+from tsbench import methods, plugins, tasks
 from tsbench.config import RunConfig
 from tsbench.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.evaluation.evaluate import evaluate
@@ -31,6 +32,7 @@ from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
 from tsbench.files import PART, taken, write_json, write_whole
 from tsbench.problem import Problem
+from tsbench.progress import progress_bar
 from tsbench.record import Record, RunDirectory
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
@@ -38,6 +40,7 @@ from tsbench.sim.model import compiled_hash
 from tsbench.typed import unknown_key
 from tsbench.workspace import RunWorkspace
 
+PACKAGE = Path(str(files("tsbench")))
 # What can change a number in a run.
 PACKAGES = (
     "dm-control",
@@ -173,7 +176,6 @@ def _work(
         workspace.note(line)
         record = _train(config, problem, workspace, console)
         write_json(run.score_file, record.as_dict())  # last: it says that the run is finished
-    tables.show_run(console, record, problem.task)
     shutil.rmtree(run.checkpoints, ignore_errors=True)
     return record.score
 
@@ -244,7 +246,7 @@ def _train(
     policy = methods.find(config.method["name"]).train(problem, workspace)
     policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
-    with tables.progress(console, "evaluate") as progress:
+    with progress_bar(console, "evaluate") as progress:
         score = evaluate(
             policy, problem.task, protocol=protocol, threads=problem.threads, progress=progress
         )
@@ -309,7 +311,7 @@ def _write_provenance(
 def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     """All that decides what a run gives, to the last bit, on one kind of machine."""
     code = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(PACKAGE.rglob("*.py")):
         code.update(path.read_bytes())
     configuration = json.dumps(config.identity, sort_keys=True)
     brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
@@ -349,8 +351,8 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that this file lies in, with "+" when it has been changed."""
-    root = Path(__file__).parents[1]
+    """The commit of the checkout that tsbench lies in, with "+" when it has been changed."""
+    root = PACKAGE.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
         return None
     git = ["git", "-C", str(root)]

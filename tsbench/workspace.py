@@ -20,8 +20,8 @@ from tsbench.errors import Stopped, TsbenchError
 from tsbench.events import Events
 from tsbench.problem import Monitor, Snapshot
 from tsbench.record import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
-from tsbench.tables import duration, number
 from tsbench.typed import typed
+from tsbench.words import duration, number
 
 INTERVAL = 30.0  # seconds of training between checkpoints
 PLAIN_INTERVAL = 60.0  # seconds between lines where there is no terminal to draw a bar on

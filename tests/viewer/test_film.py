@@ -30,7 +30,7 @@ def near(picture: NDArray[np.int64], colour: tuple[float, float, float]) -> int:
 
 def view(*words: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tsbench.cli", "view", *words], capture_output=True, text=True
+        [sys.executable, "-m", "tsbench", "view", *words], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
 

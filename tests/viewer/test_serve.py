@@ -79,7 +79,7 @@ def test_the_command_says_where_and_ends_at_ctrl_c(
     run = make_run("laikago_trot")
     words = ["view", str(run), "--push", "60N@0.5s:+y"]
     with subprocess.Popen(
-        [sys.executable, "-m", "tsbench.cli", *words],
+        [sys.executable, "-m", "tsbench", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

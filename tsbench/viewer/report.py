@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from tsbench import curves, tables
+from tsbench import curves
 from tsbench.errors import TsbenchError
 from tsbench.evaluation.score import Score
+from tsbench.evaluation.words import FIGURES, claim_force, counts, episode_rows, pushes, verdict
 from tsbench.files import write_new
 from tsbench.record import RunDirectory
 from tsbench.task import Task, plannable
@@ -23,6 +24,7 @@ from tsbench.viewer.compose import foot_bands
 from tsbench.viewer.recording import Recording, record_episode
 from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR
 from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words, run_subject
+from tsbench.words import duration, number
 
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
 LEADING = 2  # measures that the verdict tells
@@ -101,16 +103,16 @@ def _answers(subject: Subject, recording: Recording, plan: Recording | None) -> 
         ("score", "How good it is", worth_in_words(score, subject.task)),
     ):
         leads = kind == "score"
-        verdict = f'<p class="verdict">{tables.verdict(score.perturbed)}</p>' if leads else ""
+        solved = f'<p class="verdict">{verdict(score.perturbed)}</p>' if leads else ""
         yield (
-            f'<section class="{kind}"><h2>{title}</h2>{verdict}<p>{html.escape(text)}</p></section>'
+            f'<section class="{kind}"><h2>{title}</h2>{solved}<p>{html.escape(text)}</p></section>'
         )
 
 
 def worth_in_words(score: Score, task: Task[Any]) -> str:
     """What the score says, what matters most first."""
     perturbed, robustness = score.perturbed, score.robustness
-    solved, spoiled = tables.counts(perturbed)
+    solved, spoiled = counts(perturbed)
     text = (
         f"From {perturbed.episodes} starts a little different from the task's own the policy "
         f"solves the task {solved} times; {spoiled} episodes are spoiled by {task.mishap}."
@@ -118,12 +120,12 @@ def worth_in_words(score: Score, task: Task[Any]) -> str:
     for name, value in [*perturbed.measures.items()][:LEADING]:
         note = task.measure_notes.get(name)
         if value is not None:
-            text += f" {name[0].upper()}{name[1:]}: {tables.number(value)}"
+            text += f" {name[0].upper()}{name[1:]}: {number(value)}"
             text += f" ({note})." if note else "."
     text += (
         f" It earns {score.normalized_reward:.1%} of the largest possible reward, "
-        f"{tables.number(score.against_plan)} times what the best plan would. Of all pushes of "
-        f"{tables.claim_force(score):.3g} N for {robustness.push_duration_s:g} s it survives "
+        f"{number(score.against_plan)} times what the best plan would. Of all pushes of "
+        f"{claim_force(score):.3g} N for {robustness.push_duration_s:g} s it survives "
         f"{robustness.survival_100N:.0%}, and solves the task after {robustness.recovery_100N:.0%}."
     )
     return text
@@ -188,15 +190,15 @@ def _tables(subject: Subject, run: RunDirectory, planned: Recording | None) -> I
     assert subject.score is not None
     yield _table(_score_rows(subject, planned))
     changes = [
-        (name, f"{tables.counts(change)[0]} of {change.episodes}",
-         tables.number(change.normalized_reward))
+        (name, f"{counts(change)[0]} of {change.episodes}",
+         number(change.normalized_reward))
         for name, change in subject.score.score.changes.items()
     ]  # fmt: skip
     yield _table([("changed physics", "solved", "normalized_reward"), *changes])
-    yield _table([("pushes", ""), *tables.pushes(subject.score.score)])
+    yield _table([("pushes", ""), *pushes(subject.score.score)])
     costs = [
         (stage.name, f"{stage.steps:,}", f"{stage.physics_substeps:,}",
-         tables.duration(stage.seconds))
+         duration(stage.seconds))
         for stage in subject.score.stages
     ]  # fmt: skip
     yield _table([("stage", "environment steps", "physics steps", "time"), *costs])
@@ -214,12 +216,12 @@ def _tables(subject: Subject, run: RunDirectory, planned: Recording | None) -> I
 def _score_rows(subject: Subject, plan: Recording | None) -> Table:
     """The figures of all episodes, beside what the reference motion would have."""
     assert subject.score is not None
-    score, notes = subject.score.score, {**tables.FIGURES, **subject.task.measure_notes}
+    score, notes = subject.score.score, {**FIGURES, **subject.task.measure_notes}
     planned = {} if plan is None else plan.measures
     beside = ("reference motion",) if planned else ()
     rows = [("score", f"{score.perturbed.episodes} other starts", "task's own start", *beside, "")]
-    for name, value, own in tables.episode_rows(score, subject.task):
-        reference = (tables.number(planned[name]) if name in planned else "",) if planned else ()
+    for name, value, own in episode_rows(score, subject.task):
+        reference = (number(planned[name]) if name in planned else "",) if planned else ()
         rows.append((name, value, own, *reference, notes.get(name, "")))
     return rows
 

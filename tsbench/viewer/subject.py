@@ -9,8 +9,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from tsbench import tables, tasks
+from tsbench import tasks
 from tsbench.errors import TsbenchError
+from tsbench.evaluation.words import summary
 from tsbench.motion import Plan, ReferenceMotion, read_motion
 from tsbench.policy import Policy
 from tsbench.record import Record, RunDirectory
@@ -72,7 +73,7 @@ class Subject:
             plan,
             title=self.title,
             verdict=" ".join([*sentences, executed_in_words(recording)]),
-            summary=tables.summary(self.score.score, self.task) if self.score else (),
+            summary=summary(self.score.score, self.task) if self.score else (),
         )
 
 
@@ -107,7 +108,7 @@ def run_subject(run: RunDirectory) -> Subject:
     task = run.task(policy.info.task)
     score = run.record() if run.finished else None
     return Subject(
-        title=tables.run_title(score) if score else task.name,
+        title=score.title if score else task.name,
         task=task,
         policy=policy,
         reference=run.reference(task),

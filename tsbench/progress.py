@@ -1,0 +1,20 @@
+"""A progress bar on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+
+@contextmanager
+def progress_bar(console: Console, what: str) -> Iterator[Callable[[float], None]]:
+    """A bar that takes shares from 0 to 1, on a terminal; elsewhere it shows nothing."""
+    columns = (TextColumn("{task.description:<10}"), BarColumn(), TaskProgressColumn())
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        row = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(row, completed=share)
