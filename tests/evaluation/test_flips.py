@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from tsbench.evaluation.flips import Flips, flips
 from tsbench.evaluation.score import Score
-from tsbench.record import Record
+from tsbench.runs.directory import Record
 
 
 def test_flips_by_hand(invented_record: Callable[[str], Record]) -> None:

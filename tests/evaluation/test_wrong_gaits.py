@@ -18,7 +18,7 @@ from tsbench.evaluation.oracle import outcome
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import POLICIES, stored
 from tsbench.evaluation.score import Score
-from tsbench.record import RunDirectory
+from tsbench.runs.directory import RunDirectory
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.tasks.laikago import HIPS, C, Laikago, LaikagoState

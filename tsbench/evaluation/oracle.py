@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.state import State
-from tsbench.task import Task
+from tsbench.core.state import State
+from tsbench.core.task import Task
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from tsbench.core.motion import ActionLog
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.robustness import Robustness
-from tsbench.motion import ActionLog
 
 
 @dataclass(frozen=True)

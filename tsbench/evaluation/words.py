@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from tsbench.core.task import Task
+from tsbench.core.words import number
 from tsbench.evaluation.references import beside
 from tsbench.evaluation.score import Score, Summary
-from tsbench.task import Task
-from tsbench.words import number
 
 FIGURES = {  # what each says, in words
     "solved_reward": "the reward as a share of the largest possible, 0 where not solved",
