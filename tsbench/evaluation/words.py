@@ -41,7 +41,7 @@ def push_rows(score: Score) -> Iterator[tuple[str, str, str]]:
     """Labels, and values of survival and of recovery."""
     robustness = score.robustness
     yield (
-        f"of {claim_force(score):.3g} N (survival_, recovery_100N)",
+        f"of {claim_force(score):.3g} N (survival_100N, recovery_100N)",
         f"{robustness.survival_100N:.1%}",
         f"{robustness.recovery_100N:.1%}",
     )
