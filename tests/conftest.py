@@ -17,12 +17,12 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tsbench import tasks
+from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.robustness import Robustness, Surface
 from tsbench.evaluation.score import Score, Summary
-from tsbench.motion import Plan, ReferenceMotion
-from tsbench.record import Record, Stage
+from tsbench.runs.directory import Record, Stage
 from tsbench.testing.episodes import plan_of, reference_of
 
 # How fast a machine is, or how busy, is no property of the code.

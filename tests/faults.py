@@ -36,8 +36,8 @@ import numpy as np
 import pytest
 import torch
 
-import tsbench.launch  # noqa: F401  what a run imports, before the forks
-from tsbench import cli
+import tsbench.cli.launch  # noqa: F401  what a run imports, before the forks
+from tsbench.cli import verbs as cli
 from tsbench.rl.ppo import Learner
 from tsbench.rl.rollout import Rollout
 from tsbench.sim.model import load_spec

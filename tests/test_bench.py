@@ -14,9 +14,9 @@ from tsbench import bench, tasks
 from tsbench.bench import Comparison, Findings, sb3, stepping
 from tsbench.bench.training import split
 from tsbench.bench.turns import Case, Effort, Range, take_turns
-from tsbench.cli import main
-from tsbench.errors import TsbenchError
-from tsbench.motion import ReferenceMotion
+from tsbench.cli.verbs import main
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import ReferenceMotion
 from tsbench.rl.settings import PPOSettings
 from tsbench.sim import gym, single
 from tsbench.sim.tracking import Imitation

@@ -14,15 +14,17 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tsbench import config, run, tasks
-from tsbench.checkpoint import Checkpoints
-from tsbench.errors import TsbenchError
+from tsbench import tasks
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import write_json
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.policy import Policy, PolicyInfo
 from tsbench.evaluation import words
 from tsbench.evaluation.evaluate import check_fit
-from tsbench.files import write_json
-from tsbench.motion import Plan, ReferenceMotion
-from tsbench.policy import Policy, PolicyInfo
-from tsbench.record import Record, RunDirectory
+from tsbench.runs import config
+from tsbench.runs import execute as run
+from tsbench.runs.checkpoint import Checkpoints
+from tsbench.runs.directory import Record, RunDirectory
 
 NAME = "rocket_navigation"
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from tsbench import gl
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from tsbench import config, run, tasks
+from tsbench import tasks
 from tsbench.rl.ppo import Learner
 from tsbench.rl.settings import PPOSettings
+from tsbench.runs import config
+from tsbench.runs import execute as run
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.kinematic import Planning
 

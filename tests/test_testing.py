@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.arrays import array_namespace
+from tsbench.core.arrays import array_namespace
 from tsbench.tasks.rocket import Rocket, rocket_navigation
 from tsbench.testing.arrays import ArrayContract
 from tsbench.testing.contracts import Contract, PlanningContract, TaskContract

@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Literal
 
-from tsbench.errors import TsbenchError, unknown
+from tsbench.core.errors import TsbenchError, unknown
 from tsbench.gl import choose_backend
 
 if TYPE_CHECKING:
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import numpy as np
     from dm_control.rl.control import Environment
 
+    from tsbench.core.motion import ReferenceMotion
+    from tsbench.core.policy import Policy
     from tsbench.evaluation.score import Score
-    from tsbench.motion import ReferenceMotion
-    from tsbench.policy import Policy
     from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.push import Push
 
@@ -123,10 +123,10 @@ def evaluate(
     """Scores a policy by the evaluation protocol (`tsbench/evaluation/protocol.py`).
 
     Args:
-        policy: a `tsbench.policy.Policy`, the directory of one, an ONNX file, "zero" or "random",
-            a stable-baselines3 model, or any function of one observation (o,) that returns one
-            action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
-            `tsbench.adapters.from_sb3`.
+        policy: a `tsbench.core.policy.Policy`, the directory of one, an ONNX file, "zero" or
+            "random", a stable-baselines3 model, or any function of one observation (o,) that
+            returns one action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
+            `tsbench.evaluation.foreign.from_sb3`.
         task: its name.
         protocol: "v1", or "smoke" for a first look that cannot be ranked.
         threads: for the physics, None for all cores; the score does not depend on it.
@@ -136,11 +136,12 @@ def evaluate(
     """
     from pathlib import Path
 
-    from tsbench import adapters, tasks
+    from tsbench import tasks
+    from tsbench.core.policy import Policy
+    from tsbench.evaluation import foreign as adapters
     from tsbench.evaluation import protocol as protocols
     from tsbench.evaluation import references
     from tsbench.evaluation.evaluate import evaluate as score
-    from tsbench.policy import Policy
 
     made = tasks.make(task)
     if protocol not in protocols.PROTOCOLS:
@@ -168,7 +169,7 @@ def _variant(
     constants: dict[str, Any],
 ) -> Any:
     from tsbench import tasks
-    from tsbench.motion import ReferenceMotion
+    from tsbench.core.motion import ReferenceMotion
     from tsbench.sim.kinematic import Planning
     from tsbench.sim.push import Push
     from tsbench.sim.tracking import Imitation

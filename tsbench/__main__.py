@@ -2,6 +2,6 @@
 
 import sys
 
-from tsbench.cli import main
+from tsbench.cli.verbs import main
 
 sys.exit(main())

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from ctypes.util import find_library
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 
 TRIAL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 

@@ -11,7 +11,7 @@ from tsbench import tasks
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.evaluation.replay import compare, replay
-from tsbench.record import RunDirectory
+from tsbench.runs.directory import RunDirectory
 
 BOARDS = Path(__file__).parents[2] / "leaderboards"
 ENTRIES = sorted(path.parent for path in BOARDS.glob("v1/*/*/*/policy.json"))

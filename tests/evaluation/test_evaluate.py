@@ -12,14 +12,14 @@ import pytest
 
 import tsbench
 from tsbench import TsbenchError, tasks
+from tsbench.core.policy import Policy, PolicyInfo
+from tsbench.core.task import plannable
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import SMOKE, Protocol
 from tsbench.evaluation.score import Summary
-from tsbench.policy import Policy, PolicyInfo
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import fingerprint
-from tsbench.task import plannable
 from tsbench.tasks.laikago import LaikagoState
 from tsbench.tasks.rocket import Rocket, RocketState
 

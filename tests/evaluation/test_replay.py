@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from tsbench import TsbenchError, tasks
+from tsbench.core.motion import ActionLog
+from tsbench.core.typed import typed
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import constants_hash, machine
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.replay import compare, differences, replay
 from tsbench.evaluation.score import Score
-from tsbench.motion import ActionLog
 from tsbench.tasks import laikago, rocket
-from tsbench.typed import typed
 
 PROTOCOL = replace(SMOKE, perturbed=3, logged=2, conditions=SMOKE.conditions[:1], forces=(100.0,))
 TASK = tasks.make("laikago_trot", distance=0.4)  # 19 steps

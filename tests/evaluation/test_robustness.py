@@ -15,6 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tsbench import tasks
+from tsbench.core.state import State
+from tsbench.core.task import Task
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE, V1, Condition, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import (
@@ -29,8 +31,6 @@ from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.push import Push
 from tsbench.sim.single import environment
-from tsbench.state import State
-from tsbench.task import Task
 from tsbench.testing.episodes import one_of_each_kind
 
 NONE = Condition("as it is")

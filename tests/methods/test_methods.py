@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from tsbench import TsbenchError, methods, tasks
-from tsbench.config import compose
+from tsbench.core.method import Budget, Problem
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.plugins import Plugin, Provider
+from tsbench.core.policy import Policy, PolicyInfo
+from tsbench.core.task import plannable
 from tsbench.evaluation.evaluate import check_fit
 from tsbench.methods import twostage
-from tsbench.motion import Plan, ReferenceMotion
-from tsbench.plugins import Plugin, Provider
-from tsbench.policy import Policy, PolicyInfo
-from tsbench.problem import Budget, Problem
 from tsbench.rl.stages import settings
-from tsbench.run import prepare
+from tsbench.runs.config import compose
+from tsbench.runs.execute import prepare
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
-from tsbench.task import plannable
 from tsbench.testing import MethodContract
 from tsbench.testing.contracts import Desk, bits
 from tsbench.testing.episodes import plannable_tasks

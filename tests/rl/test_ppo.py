@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from tsbench import TsbenchError, tasks
-from tsbench.errors import NotFiniteError
-from tsbench.motion import ReferenceMotion
-from tsbench.policy import ENCODINGS, Policy
-from tsbench.problem import Budget, Problem, Workspace
+from tsbench.core.errors import NotFiniteError
+from tsbench.core.method import Budget, Problem, Workspace
+from tsbench.core.motion import ReferenceMotion
+from tsbench.core.policy import ENCODINGS, Policy
 from tsbench.rl.ppo import Learner
 from tsbench.rl.settings import PPOSettings
 from tsbench.rl.stages import StageSettings, learn_planning, settings

@@ -15,7 +15,7 @@ def threads():
 
 torch.set_num_threads(3)
 threadpool_limits(2, user_api="blas")
-import tsbench.bench, tsbench.run, tsbench.rl.stages
+import tsbench.bench, tsbench.rl.stages, tsbench.runs.execute
 print(*threads())
 
 from tsbench import tasks

@@ -16,13 +16,13 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from tsbench import tasks
-from tsbench.checkpoint import decode, encode
-from tsbench.errors import TsbenchError
-from tsbench.policy import ACTIVATIONS
+from tsbench.core.errors import TsbenchError
+from tsbench.core.policy import ACTIVATIONS
 from tsbench.rl.ppo import Learner
 from tsbench.rl.rollout import Rollout
 from tsbench.rl.settings import OPTIMIZERS, PPOSettings
 from tsbench.rl.update import WIDE, Network, NumpyUpdate, RslUpdate, Update, make_update
+from tsbench.runs.checkpoint import decode, encode
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.kinematic import Planning
 

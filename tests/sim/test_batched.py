@@ -10,11 +10,11 @@ import pytest
 
 import tsbench
 from tsbench import tasks
-from tsbench.motion import ReferenceMotion
+from tsbench.core.motion import ReferenceMotion
+from tsbench.core.state import Start
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
-from tsbench.state import Start
 from tsbench.testing.episodes import compare, plannable_tasks, play_batched, same
 
 ROWS = 3

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsbench.arrays import Array
+from tsbench.core.arrays import Array
+from tsbench.core.state import State
+from tsbench.core.task import MDP
 from tsbench.sim.episodes import Episodes, play
-from tsbench.state import State
-from tsbench.task import MDP
 
 HORIZON = 10
 

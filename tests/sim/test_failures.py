@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.errors import NotFiniteError, TsbenchError
+from tsbench.core.errors import NotFiniteError, TsbenchError
+from tsbench.core.state import Start, State
+from tsbench.core.task import Task
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.episodes import play
 from tsbench.sim.single import environment
-from tsbench.state import Start, State
-from tsbench.task import Task
 
 STILL = np.zeros((3, 12))
 

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import tsbench
 from tsbench import TsbenchError, tasks
-from tsbench.motion import ReferenceMotion
+from tsbench.core.motion import ReferenceMotion
 from tsbench.sim.gym import GymEnvironment, GymVectorEnvironment
 from tsbench.testing.episodes import one_of_each_kind
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import tsbench
 from tsbench import TsbenchError, tasks
+from tsbench.core.state import Start, State
 from tsbench.sim.batched import Physics
 from tsbench.sim.push import Push
-from tsbench.state import Start, State
 from tsbench.tasks.laikago import LaikagoState
 from tsbench.tasks.rocket import RocketState
 

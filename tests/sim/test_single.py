@@ -11,7 +11,7 @@ import pytest
 
 import tsbench
 from tsbench import tasks
-from tsbench.motion import ReferenceMotion
+from tsbench.core.motion import ReferenceMotion
 from tsbench.sim.single import PhysicsAdapter, environment
 from tsbench.sim.tracking import Imitation
 from tsbench.tasks.laikago import LaikagoState

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tsbench import TsbenchError, tasks
-from tsbench.motion import ReferenceMotion
+from tsbench.core.motion import ReferenceMotion
 from tsbench.sim.batched import Physics
 from tsbench.sim.tracking import Imitation, deepmimic_reward
 from tsbench.testing.episodes import plannable_tasks

@@ -9,7 +9,7 @@ import pytest
 
 import tsbench
 from tsbench import TsbenchError, tasks
-from tsbench.motion import ReferenceMotion
+from tsbench.core.motion import ReferenceMotion
 from tsbench.testing import ArrayContract, PlanningContract, TaskContract
 from tsbench.testing.episodes import plannable_tasks
 

@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 
 from tsbench import TsbenchError, methods
-from tsbench.arrays import Array, array_namespace
+from tsbench.core.arrays import Array, array_namespace
+from tsbench.core.method import Budget, Problem
+from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.state import Readings, Rng, Start, State
+from tsbench.core.task import Abstraction, Plannable, Task, Tracker
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.methods.twostage import extract
-from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
-from tsbench.problem import Budget, Problem
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.kinematic import Planning, naive_plan
 from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
-from tsbench.state import Readings, Rng, Start, State
-from tsbench.task import Abstraction, Plannable, Task, Tracker
 from tsbench.viewer.recording import record_episode
 
 RAIL = """

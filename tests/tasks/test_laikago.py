@@ -13,11 +13,12 @@ from scipy.signal import butter, freqz, lfilter
 from scipy.spatial.transform import Rotation
 
 import tsbench
-from tsbench import TsbenchError, rotations, tasks
-from tsbench.motion import Plan, ReferenceMotion
+from tsbench import TsbenchError, tasks
+from tsbench.core import rotations
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.state import Start
 from tsbench.sim.batched import Physics
 from tsbench.sim.model import compiled
-from tsbench.state import Start
 from tsbench.tasks import laikago
 from tsbench.tasks.laikago import Laikago, LaikagoState
 from tsbench.testing.episodes import Case, compare, ending

@@ -14,10 +14,10 @@ import pytest
 
 import tsbench
 from tsbench import TsbenchError, tasks
-from tsbench.motion import Plan, ReferenceMotion
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.state import Start
 from tsbench.planning.path import Path
 from tsbench.sim.batched import Physics
-from tsbench.state import Start
 from tsbench.tasks.rocket import Rocket, RocketState
 from tsbench.testing.episodes import Case, compare, ending
 

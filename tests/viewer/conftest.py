@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.files import write_json
-from tsbench.motion import Plan, ReferenceMotion
-from tsbench.policy import Policy, PolicyInfo
-from tsbench.record import Record
+from tsbench.core.files import write_json
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.policy import Policy, PolicyInfo
+from tsbench.runs.directory import Record
 from tsbench.sim.model import fingerprint
 
 

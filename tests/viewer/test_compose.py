@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.drawing import Drawing
-from tsbench.errors import TsbenchError
-from tsbench.motion import ReferenceMotion
+from tsbench.core.drawing import Drawing
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import ReferenceMotion
 from tsbench.viewer.compose import compose, compose_pair, compose_plan, spans
 from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.recording import Recording, record_episode, record_motion

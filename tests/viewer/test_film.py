@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.viewer import film
 from tsbench.viewer.show import PLAN_COLOUR, PUSH_COLOUR, Actor, Show
 

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from websockets.sync.client import ClientConnection, connect
 
-from tsbench.errors import TsbenchError
-from tsbench.files import write_new
-from tsbench.record import RunDirectory
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import write_new
+from tsbench.runs.directory import RunDirectory
 from tsbench.sim.model import load_spec
 from tsbench.viewer import page, report, scene
 from tsbench.viewer.framing import framing

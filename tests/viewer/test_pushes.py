@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.sim.push import direction
 from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.subject import pair, subject

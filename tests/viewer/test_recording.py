@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import ReferenceMotion
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE
-from tsbench.motion import ReferenceMotion
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.push import Push
 from tsbench.tasks.laikago import LaikagoState

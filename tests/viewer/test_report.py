@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from tsbench import cli, curves
-from tsbench.errors import TsbenchError
-from tsbench.motion import Plan
-from tsbench.record import RunDirectory
-from tsbench.viewer import report
+from tsbench.cli import verbs as cli
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import Plan
+from tsbench.runs.directory import RunDirectory
+from tsbench.viewer import curves, report
 
 MakeRun = Callable[..., Path]
 

@@ -15,7 +15,7 @@ import umsgpack
 from meshcat import Visualizer
 from PIL import Image
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.sim.model import model_path
 from tsbench.viewer import scene
 from tsbench.viewer.page import Recorder

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.viewer import serve
 
 

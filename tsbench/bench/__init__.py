@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tsbench.bench.turns import FULL, QUICK, Effort, Range
-from tsbench.errors import unknown
+from tsbench.core.errors import unknown
 
 # What can change a figure.
 PACKAGES = ("mujoco", "numpy", "torch", "rsl-rl-lib", "dm-control", "gymnasium", "mink")

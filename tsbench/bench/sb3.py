@@ -30,22 +30,22 @@ from rich.console import Console
 from tsbench import methods
 from tsbench.bench import Findings, comparison
 from tsbench.bench.turns import Effort, Range
-from tsbench.config import compose
-from tsbench.motion import ReferenceMotion
-from tsbench.policy import ENCODINGS
-from tsbench.problem import Problem
-from tsbench.record import RunDirectory
+from tsbench.core.method import Problem
+from tsbench.core.motion import ReferenceMotion
+from tsbench.core.policy import ENCODINGS
+from tsbench.core.task import Task
 from tsbench.rl.settings import PPOSettings
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
-from tsbench.run import prepare
+from tsbench.runs.config import compose
+from tsbench.runs.directory import RunDirectory
+from tsbench.runs.execute import prepare
+from tsbench.runs.workspace import RunWorkspace
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.gym import GymEnvironment
 from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
-from tsbench.task import Task
-from tsbench.workspace import RunWorkspace
 
 LEARNING_RATE = 3e-4  # Stable-Baselines3's own
 PATIENCE = 6.0  # times our time, after which it has failed

@@ -25,11 +25,11 @@ from mujoco.rollout import Rollout
 from tsbench import tasks
 from tsbench.bench import Findings, comparison
 from tsbench.bench.turns import Case, Effort, take_turns
+from tsbench.core.task import MDP, Task
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.gym import GymEnvironment
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.single import environment
-from tsbench.task import MDP, Task
 
 NOISE = 0.2  # standard deviation of actions: robots move, and stand for a while
 RECORDED = 40  # control steps that the bare rollout repeats

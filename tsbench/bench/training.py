@@ -15,15 +15,15 @@ from rich.console import Console
 
 from tsbench.bench import Findings, comparison
 from tsbench.bench.turns import Effort, Range
-from tsbench.config import compose
-from tsbench.problem import Problem
-from tsbench.record import METRICS
+from tsbench.core.method import Problem
+from tsbench.core.task import plannable
 from tsbench.rl.stages import learn_physics, learn_planning, settings
-from tsbench.run import prepare
+from tsbench.runs.config import compose
+from tsbench.runs.directory import METRICS
+from tsbench.runs.execute import prepare
+from tsbench.runs.workspace import RunWorkspace
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.tracking import Imitation
-from tsbench.task import plannable
-from tsbench.workspace import RunWorkspace
 
 TASKS = ("laikago_trot", "rocket_navigation")
 

@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import ActionLog
+from tsbench.core.policy import Policy
+from tsbench.core.state import Start
+from tsbench.core.task import Task
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import V1, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import robustness
 from tsbench.evaluation.score import Score, Summary
-from tsbench.motion import ActionLog
-from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
-from tsbench.state import Start
-from tsbench.task import Task
 
 
 def evaluate(

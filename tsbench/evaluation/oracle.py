@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.task import Task
+from tsbench.core.task import Task
 
 
 def best_return(task: Task[Any]) -> float:

@@ -13,12 +13,12 @@ import numpy as np
 from threadpoolctl import threadpool_info
 
 from tsbench import tasks
-from tsbench.adapters import ForeignPolicy
+from tsbench.core.policy import Policy
+from tsbench.core.task import Task
+from tsbench.evaluation.foreign import ForeignPolicy
 from tsbench.evaluation.protocol import Protocol
-from tsbench.policy import Policy
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import compiled_hash, fingerprint
-from tsbench.task import Task
 
 PACKAGES = ("mujoco", "numpy", "scipy", "tsbench")
 

@@ -28,9 +28,9 @@ from typing import Any
 
 import numpy as np
 
+from tsbench.core.state import Start
+from tsbench.core.task import Task
 from tsbench.sim.change import Change
-from tsbench.state import Start
-from tsbench.task import Task
 
 REFERENCE_MASS = 25.433  # kg, of Laikago
 

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from tsbench import tasks
-from tsbench.adapters import ForeignPolicy, from_function
-from tsbench.errors import unknown
+from tsbench.core.errors import unknown
+from tsbench.core.task import MDP, Task
 from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.foreign import ForeignPolicy, from_function
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.score import Score
-from tsbench.task import MDP, Task
 
 DECIMALS = 6  # of an observation that the random policy tells apart
 

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from tsbench.core.motion import ActionLog
+from tsbench.core.state import Start
+from tsbench.core.task import Task
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import perturbed_starts
 from tsbench.evaluation.score import Score
-from tsbench.motion import ActionLog
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import Episodes, play
-from tsbench.state import Start
-from tsbench.task import Task
 
 SAME_REWARD = 1e-12  # of itself, from kernel to kernel; another physics is farther off
 

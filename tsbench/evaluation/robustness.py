@@ -9,12 +9,12 @@ import numpy as np
 from scipy.optimize import isotonic_regression
 from scipy.stats import binomtest
 
+from tsbench.core.state import Start
+from tsbench.core.task import Task
 from tsbench.evaluation.protocol import REFERENCE_MASS, Protocol
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.push import Push, direction
-from tsbench.state import Start
-from tsbench.task import Task
 
 # Pushes that are played side by side. Each rocket takes 15 MB of address space; more are no faster.
 _BLOCK = 128

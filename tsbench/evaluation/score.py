@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from tsbench.core.motion import ActionLog
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.robustness import Robustness
-from tsbench.motion import ActionLog
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from tsbench.core.words import number
 from tsbench.evaluation.score import Score, Summary
-from tsbench.words import number
 
 
 def summary(score: Score) -> list[tuple[str, str]]:

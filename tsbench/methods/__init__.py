@@ -2,7 +2,7 @@
 
 `tsbench.methods.NAME` has a dataclass `Options` and a function
 `train(problem, workspace) -> Policy`; with PPO stages it names their kinds in `STAGES`. Both files
-may also lie in another package (see `tsbench.plugins`).
+may also lie in another package (see `tsbench.core.plugins`).
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from importlib.abc import InspectLoader
 from importlib.util import find_spec
 from typing import Any, Protocol, cast
 
-from tsbench import plugins
-from tsbench.errors import TsbenchError, unknown
-from tsbench.plugins import Plugin, Provider
-from tsbench.policy import Policy
-from tsbench.problem import Problem, Workspace
-from tsbench.typed import typed
+from tsbench.core import plugins
+from tsbench.core.errors import TsbenchError, unknown
+from tsbench.core.method import Problem, Workspace
+from tsbench.core.plugins import Plugin, Provider
+from tsbench.core.policy import Policy
+from tsbench.core.typed import typed
 
 
 class Method(Protocol):

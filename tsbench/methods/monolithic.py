@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tsbench.core.method import Problem, Workspace
+from tsbench.core.policy import Policy
 from tsbench.methods import options
-from tsbench.policy import Policy
-from tsbench.problem import Problem, Workspace
 from tsbench.rl.stages import learn_physics
 
 STAGES = ("task",)

@@ -10,15 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from tsbench.core.method import Problem, Workspace
+from tsbench.core.motion import Plan
+from tsbench.core.policy import Policy
+from tsbench.core.task import plannable
 from tsbench.methods import options
-from tsbench.motion import Plan
-from tsbench.policy import Policy
-from tsbench.problem import Problem, Workspace
 from tsbench.rl.stages import learn_physics, learn_planning
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
-from tsbench.task import plannable
 
 STAGES = ("plan", "imitate", "finetune")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tsbench.arrays import Array, like
+from tsbench.core.arrays import Array, like
 
 # Share of a cycle by which an instant may miss a touchdown or lift-off and still be at it: more
 # than the rounding of single precision after some cycles, far less than a control step.

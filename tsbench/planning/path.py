@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tsbench.arrays import Array, array_namespace, like
+from tsbench.core.arrays import Array, array_namespace, like
 
 _BEFORE_AND_AFTER = np.array([-1, 0])  # the segments at a vertex
 

@@ -18,8 +18,9 @@ import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
-from tsbench.errors import NotFiniteError, TsbenchError
-from tsbench.policy import Policy, PolicyInfo
+from tsbench.core.errors import NotFiniteError, TsbenchError
+from tsbench.core.policy import Policy, PolicyInfo
+from tsbench.core.task import Task
 from tsbench.rl.rollout import Rollout
 from tsbench.rl.settings import PPOSettings
 from tsbench.rl.threads import one_thread
@@ -27,7 +28,6 @@ from tsbench.rl.update import make_update
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.model import fingerprint
-from tsbench.task import Task
 
 Prepare = Callable[[int], None]  # (environment steps so far)
 Report = Callable[[int, Mapping[str, float]], None]  # (environment steps so far, metrics)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tsbench.policy import ACTIVATIONS, ENCODINGS
+from tsbench.core.policy import ACTIVATIONS, ENCODINGS
 
 UPDATES = ("auto", "numpy", "rsl_rl")  # rl/update.py says what `auto` takes
 OPTIMIZERS = ("adam", "adamw", "rmsprop", "sgd")  # rsl-rl's

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tsbench.errors import TsbenchError
-from tsbench.problem import Monitor, Problem, Workspace
+from tsbench.core.errors import TsbenchError
+from tsbench.core.method import Monitor, Problem, Workspace
+from tsbench.core.task import SimulatedTask
+from tsbench.core.typed import typed_items
 from tsbench.rl.ppo import Learner, Report
 from tsbench.rl.settings import PPOSettings
 from tsbench.sim.batched import BatchedEnvironment, Physics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
-from tsbench.task import SimulatedTask
-from tsbench.typed import typed_items
 
 
 @dataclass(frozen=True)

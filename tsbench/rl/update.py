@@ -19,7 +19,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from torch import nn
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.rl.settings import PPOSettings
 
 WIDE = 512  # units of a hidden layer from which numpy gains less than a third (docs/speed.md)

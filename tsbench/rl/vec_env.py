@@ -10,7 +10,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from tsbench.policy import ENCODINGS
+from tsbench.core.policy import ENCODINGS
 from tsbench.sim.batched import BatchedEnvironment
 
 

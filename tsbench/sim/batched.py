@@ -18,14 +18,14 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from tsbench.arrays import Array, step_of
-from tsbench.errors import NotFiniteError, TsbenchError
+from tsbench.core.arrays import Array, step_of
+from tsbench.core.errors import NotFiniteError, TsbenchError
+from tsbench.core.state import Readings, Rng, S, Start, State
+from tsbench.core.task import MDP, SimulatedTask
 from tsbench.sim.change import Change
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
 from tsbench.sim.quiet import QUIET
-from tsbench.state import Readings, Rng, S, Start, State
-from tsbench.task import MDP, SimulatedTask
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 _NUMBER = 1  # of a kind of warning, beside what it was about, in `Batch.warning`

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from tsbench.core.state import Rng, S
+from tsbench.core.task import SimulatedTask
 from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
 from tsbench.sim.push import Push, direction
-from tsbench.state import Rng, S
-from tsbench.task import SimulatedTask
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Generic
 
 import numpy as np
 
-from tsbench.arrays import step_of
+from tsbench.core.arrays import step_of
+from tsbench.core.state import S
+from tsbench.core.task import MDP
 from tsbench.sim.batched import Dynamics, expect_finite
-from tsbench.state import S
-from tsbench.task import MDP
 
 PolicyFunction = Callable[[np.ndarray], np.ndarray]  # observations (n, o) -> actions (n, a)
 

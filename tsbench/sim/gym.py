@@ -18,9 +18,9 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from tsbench.errors import TsbenchError, unknown
+from tsbench.core.errors import TsbenchError, unknown
+from tsbench.core.task import MDP
 from tsbench.sim.batched import BatchedEnvironment
-from tsbench.task import MDP
 
 RENDER_MODES = ("rgb_array",)
 HEIGHT, WIDTH = 480, 640  # pixels

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.arrays import Array
-from tsbench.motion import Plan
-from tsbench.state import Rng, S
-from tsbench.task import MDP, Task, plannable
+from tsbench.core.arrays import Array
+from tsbench.core.motion import Plan
+from tsbench.core.state import Rng, S
+from tsbench.core.task import MDP, Task, plannable
 
 
 class Planning(MDP[S]):

@@ -11,8 +11,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from tsbench.errors import TsbenchError
-from tsbench.plugins import OWN, walk
+from tsbench.core.errors import TsbenchError
+from tsbench.core.plugins import OWN, walk
 
 # A wheel ships models/ inside the package; a checkout has it beside the package.
 _FOLDERS = (

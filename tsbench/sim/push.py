@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.task import Plant
+from tsbench.core.task import Plant
 
 
 def direction(plant: Plant[Any], heading: np.ndarray | float) -> np.ndarray:

@@ -14,15 +14,15 @@ from dm_control import mujoco as dm_mujoco
 from dm_control.mujoco.wrapper import MjModel
 from dm_control.rl import control
 
-from tsbench.arrays import Array, step_of
+from tsbench.core.arrays import Array, step_of
+from tsbench.core.state import Readings, State
+from tsbench.core.task import MDP, SimulatedTask
 from tsbench.sim.batched import expect_finite, expect_shape
 from tsbench.sim.change import Change
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push
 from tsbench.sim.quiet import QUIET
-from tsbench.state import Readings, State
-from tsbench.task import MDP, SimulatedTask
 
 ROW = np.array([0])  # the batch of one that every state here is
 

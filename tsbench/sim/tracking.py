@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from tsbench.arrays import Array, array_namespace
-from tsbench.motion import ReferenceMotion
-from tsbench.state import Rng, S, Start
-from tsbench.task import Plant, SimulatedTask, Task, plannable
+from tsbench.core.arrays import Array, array_namespace
+from tsbench.core.motion import ReferenceMotion
+from tsbench.core.state import Rng, S, Start
+from tsbench.core.task import Plant, SimulatedTask, Task, plannable
 
 
 class Imitation(SimulatedTask[S]):

@@ -1,6 +1,6 @@
 """The tasks. A new one is one file here, one MJCF in models/ and one config in conf/task/.
 
-All of them may also lie in another package (see `tsbench.plugins`).
+All of them may also lie in another package (see `tsbench.core.plugins`).
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from tsbench import plugins
-from tsbench.errors import TsbenchError, unknown
-from tsbench.plugins import Provider
-from tsbench.task import Task
+from tsbench.core import plugins
+from tsbench.core.errors import TsbenchError, unknown
+from tsbench.core.plugins import Provider
+from tsbench.core.task import Task
 
 Factory = Callable[..., Task[Any]]
 

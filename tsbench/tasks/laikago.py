@@ -15,17 +15,17 @@ import mujoco
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from tsbench.arrays import Array, array_namespace, filled, like
-from tsbench.constants import constant
-from tsbench.drawing import Drawing
-from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.arrays import Array, array_namespace, filled, like
+from tsbench.core.constants import constant
+from tsbench.core.drawing import Drawing
+from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.rotations import angle_between, multiply, to_heading, upward
+from tsbench.core.state import Readings, Rng, Start, State
+from tsbench.core.task import Abstraction, Plannable, Tracker
 from tsbench.planning.gait import Gait
 from tsbench.planning.ik import FootPoses
-from tsbench.rotations import angle_between, multiply, to_heading, upward
 from tsbench.sim.model import compiled, load_spec
 from tsbench.sim.tracking import deepmimic_reward
-from tsbench.state import Readings, Rng, Start, State
-from tsbench.task import Abstraction, Plannable, Tracker
 from tsbench.tasks import register
 
 FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")

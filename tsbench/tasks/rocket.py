@@ -13,14 +13,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from tsbench.arrays import Array, array_namespace, like
-from tsbench.constants import constant
-from tsbench.drawing import Drawing, Flame
-from tsbench.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.arrays import Array, array_namespace, like
+from tsbench.core.constants import constant
+from tsbench.core.drawing import Drawing, Flame
+from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.state import Readings, Rng, Start, State
+from tsbench.core.task import Abstraction, Plannable, Tracker
 from tsbench.planning.path import Path
 from tsbench.sim.model import load_spec
-from tsbench.state import Readings, Rng, Start, State
-from tsbench.task import Abstraction, Plannable, Tracker
 from tsbench.tasks import register
 
 

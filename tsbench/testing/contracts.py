@@ -15,18 +15,20 @@ import numpy as np
 import pytest
 
 import tsbench
-from tsbench import config, methods, run, tasks
+from tsbench import methods, tasks
+from tsbench.core.method import Budget, Problem, Snapshot
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.policy import Policy
+from tsbench.core.task import Plannable
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.references import zero
-from tsbench.motion import Plan, ReferenceMotion
-from tsbench.policy import Policy
-from tsbench.problem import Budget, Problem, Snapshot
+from tsbench.runs import config
+from tsbench.runs import execute as run
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import fingerprint
 from tsbench.sim.tracking import Imitation
-from tsbench.task import Plannable
 from tsbench.testing.episodes import (
     Case,
     at_random,

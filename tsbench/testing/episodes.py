@@ -12,12 +12,12 @@ import numpy as np
 
 import tsbench
 from tsbench import tasks
-from tsbench.motion import Plan, ReferenceMotion
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.state import Start, State
+from tsbench.core.task import Plannable, SimulatedTask, plannable
 from tsbench.sim.batched import Physics
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.single import Adapter, environment
-from tsbench.state import Start, State
-from tsbench.task import Plannable, SimulatedTask, plannable
 
 Actions = Callable[[], np.ndarray]  # the action of each step in turn
 

@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tsbench import curves
 from tsbench.evaluation.robustness import Surface
+from tsbench.viewer import curves
 from tsbench.viewer.recording import Array, Recording
 from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR, Band, Rgb
 

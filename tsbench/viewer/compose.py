@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.viewer.framing import reach
 from tsbench.viewer.props import balance_marks, contact_marks, flames, planned_marks, push_arrows
 from tsbench.viewer.recording import Recording

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from tsbench.errors import TsbenchError
-from tsbench.files import check_new
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import check_new
 from tsbench.viewer import scene
 from tsbench.viewer.framing import Framing, framing
 from tsbench.viewer.scene import Array

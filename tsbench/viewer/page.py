@@ -25,7 +25,7 @@ import umsgpack
 from meshcat import Visualizer
 from numpy.typing import NDArray
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.viewer import scene
 from tsbench.viewer.framing import Framing, framing
 from tsbench.viewer.scene import Array

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tsbench.drawing import Flame
+from tsbench.core.drawing import Flame
 from tsbench.viewer import scene
 from tsbench.viewer.framing import reach
 from tsbench.viewer.recording import Recording

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
+from tsbench.core.task import Plant
 from tsbench.sim.push import Push, direction
-from tsbench.task import Plant
 
 DURATION = 0.1  # s, of every push that is written so; the protocol's
 _NUMBER = r"\d+(?:\.\d+)?"

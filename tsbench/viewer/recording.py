@@ -11,15 +11,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tsbench.core.motion import ReferenceMotion
+from tsbench.core.policy import Policy
+from tsbench.core.state import Readings, S, State
+from tsbench.core.task import Task, plannable
 from tsbench.evaluation.evaluate import check_fit
-from tsbench.motion import ReferenceMotion
-from tsbench.policy import Policy
 from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.model import sensor_slices
 from tsbench.sim.push import Push
-from tsbench.state import Readings, S, State
-from tsbench.task import Task, plannable
 
 Array = NDArray[np.float64]
 

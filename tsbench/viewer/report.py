@@ -11,19 +11,18 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from tsbench import curves
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import write_new
+from tsbench.core.task import plannable
+from tsbench.core.words import duration, number
 from tsbench.evaluation.score import Score
 from tsbench.evaluation.words import counts, pushes
-from tsbench.files import write_new
-from tsbench.record import RunDirectory
-from tsbench.task import plannable
-from tsbench.viewer import charts, page
+from tsbench.runs.directory import RunDirectory
+from tsbench.viewer import charts, curves, page
 from tsbench.viewer.compose import foot_bands
 from tsbench.viewer.recording import Recording, record_episode
 from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR
 from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words, run_subject
-from tsbench.words import duration, number
 
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
 

@@ -24,7 +24,7 @@ from meshcat import Visualizer
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float, float]  # red, green, blue, opacity in [0, 1]

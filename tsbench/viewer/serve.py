@@ -12,7 +12,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs, urlencode, urlsplit
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 
 HOST = "127.0.0.1"  # nobody else's machine
 KEPT = 8  # pages, so that reloading one is quick

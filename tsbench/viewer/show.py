@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
 from tsbench.viewer import scene
 from tsbench.viewer.scene import Array, Colour
 

@@ -7,8 +7,8 @@ import math
 import mujoco
 import numpy as np
 
-from tsbench.drawing import Drawing
-from tsbench.errors import TsbenchError
+from tsbench.core.drawing import Drawing
+from tsbench.core.errors import TsbenchError
 from tsbench.viewer.framing import reach
 from tsbench.viewer.recording import Recording
 from tsbench.viewer.scene import Array, Colour

@@ -10,14 +10,14 @@ from typing import Any, cast
 import numpy as np
 
 from tsbench import tasks
-from tsbench.errors import TsbenchError
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import Plan, ReferenceMotion, read_motion
+from tsbench.core.policy import Policy
+from tsbench.core.task import Task, plannable
 from tsbench.evaluation.words import summary
-from tsbench.motion import Plan, ReferenceMotion, read_motion
-from tsbench.policy import Policy
-from tsbench.record import Record, RunDirectory
+from tsbench.runs.directory import Record, RunDirectory
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.push import Push
-from tsbench.task import Task, plannable
 from tsbench.viewer.compose import compose, compose_pair, compose_plan
 from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.recording import Recording, record_episode, record_motion

@@ -1,0 +1,159 @@
+"""Words to configurations: what is accepted, and what each mistake is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+from tsbench import methods, tasks
+from tsbench.runs import config
+from tsbench.core.errors import TsbenchError
+from tsbench.core.typed import typed
+
+TASK = "task=rocket_navigation"
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_every_task_has_a_config_with_the_three_budgets(name: str) -> None:
+    chosen = config.compose([f"task={name}"])
+    assert chosen.task.name == name
+    assert {"smoke", "fast", "paper"} <= set(chosen.task.budgets)
+    assert chosen.budget == "fast"
+    assert chosen.method["name"] == "twostage"
+    assert chosen.task.constants == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "plan", "act"),
+    [
+        ("rocket_navigation", 1_000_000, 1_000_000),
+        ("rocket_obstacles", 1_000_000, 4_000_000),
+        ("laikago_walk", 10_000_000, 10_000_000),
+        ("laikago_trot", 10_000_000, 10_000_000),
+    ],
+)
+def test_the_paper_budget_is_the_papers(name: str, plan: int, act: int) -> None:
+    paper = config.compose([f"task={name}", "budget=paper"]).task.budgets["paper"]
+    assert (paper.plan, paper.act, paper.environments) == (plan, act, None)
+
+
+def test_no_central_list_of_tasks_and_methods() -> None:
+    assert config.names("task") == tasks.names()
+    assert config.names("method") == methods.names()
+
+
+def test_words_change_values_and_open_mappings_need_no_plus() -> None:
+    words = [TASK, "seed=7", "task.training.plan.clip=0.3", "task.constants.distance=40.0"]
+    chosen = config.compose([*words, "task.budgets.smoke.act=2_000"])
+    assert chosen.seed == 7
+    assert chosen.task.training["plan"]["clip"] == 0.3
+    assert chosen.task.constants == {"distance": 40.0}
+    assert chosen.task.budgets["smoke"].act == 2000
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ([], f"task=NAME is missing; allowed: {', '.join(tasks.names())}"),
+        (["task=rocket_navigatoin"], "unknown task 'rocket_navigatoin'; allowed: "),
+        (["task=rocket_navigatoin"], "(did you mean 'rocket_navigation'?)"),
+        (["task=../x"], "unknown task '../x'"),
+        (["task=null"], "Config group override must be a string"),
+        ([TASK, "method=towstage"], "(did you mean 'twostage'?)"),
+        ([TASK, "~method"], "method is missing"),
+        (
+            [TASK, "sed=1"],
+            "unknown key 'sed'; allowed: budget, checkpoint, directory, method, seed, ",
+        ),
+        ([TASK, "sed=1"], "(did you mean 'seed'?)"),
+        ([TASK, "+extra=1"], "unknown key 'extra'"),
+        ([TASK, "task.bugets.fast.plan=1"], "unknown key in task 'bugets'"),
+        ([TASK, "method.nmae=x"], "unknown key in method 'nmae'"),
+        ([TASK, "seed=abc"], "seed must be a whole number, not 'abc'"),
+        ([TASK, "seed=1.5"], "seed must be a whole number, not 1.5"),
+        ([TASK, "seed=true"], "seed must be a whole number, not True"),
+        ([TASK, "seed=null"], "seed must be a whole number, not None"),
+        ([TASK, "seed=-1"], "seed must lie between 0 and 4294967295, not -1"),
+        ([TASK, "seed=4294967296"], "seed must lie between 0 and 4294967295, not 4294967296"),
+        ([TASK, "threads=0"], "threads must be at least 1, not 0"),
+        ([TASK, "checkpoint=-1"], "checkpoint must not be negative, not -1.0"),
+        ([TASK, "checkpoint=nan"], "checkpoint must not be negative, not nan"),
+        ([TASK, "budget=fats"], "unknown budget 'fats'; allowed: fast, paper, smoke"),
+        ([TASK, "budget=1"], "budget must be text, not 1"),
+        ([TASK, "task.budgets.fast.plan=0"], "task.budgets.fast.plan must be at least 1, not 0"),
+        ([TASK, "task.budgets.fast=3"], "task.budgets.fast must be key: value pairs, not 3"),
+        ([TASK, "task.training.plan=3"], "task.training.plan must be key: value pairs, not 3"),
+        ([TASK, "seed=${nothing}"], "Interpolation key 'nothing' not found"),
+        ([TASK, "seed=???"], "Missing mandatory value: seed"),
+        ([TASK, "seed=1,2"], "seed=1,2 asks for several runs: add -m for a sweep"),
+        ([TASK, "rubbish"], "cannot read 'rubbish': expected key=value"),
+        ([TASK, "seed=["], "cannot read 'seed=[': expected key=value, the value quoted where"),
+    ],
+)
+def test_a_mistake_gets_one_line(words: list[str], line: str) -> None:
+    with pytest.raises(TsbenchError) as caught:
+        config.compose(words)
+    assert line in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_sweep_is_every_combination() -> None:
+    jobs = list(config.sweep([TASK, "seed=range(0,2)", "budget=smoke,fast"]))
+    assert jobs == [
+        [TASK, "seed=0", "budget=smoke"],
+        [TASK, "seed=0", "budget=fast"],
+        [TASK, "seed=1", "budget=smoke"],
+        [TASK, "seed=1", "budget=fast"],
+    ]
+
+
+def test_intervals_are_left_to_the_sweeper() -> None:
+    assert list(config.sweep([TASK, "method.finetune=interval(0,1)"])) == [[TASK]]
+
+
+@dataclass(frozen=True)
+class Inner:
+    size: int
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner
+    rate: float = 0.5
+    sizes: tuple[int, ...] = ()
+    by_name: dict[str, bool] | None = None
+
+    def __post_init__(self) -> None:
+        if self.rate < 0.0:
+            raise ValueError("rate must not be negative")
+
+
+def test_typed_builds_what_the_annotations_say() -> None:
+    content = {"inner": {"size": 3}, "rate": 1, "sizes": [1, 2], "by_name": {"a": True}}
+    built = typed(Outer, content, "")
+    assert built == Outer(Inner(3), 1.0, (1, 2), {"a": True})
+    assert type(built.rate) is float
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ({}, "inner is missing"),
+        ({"inner": {}}, "inner.size is missing"),
+        ({"inner": {"size": "3"}}, "inner.size must be a whole number, not '3'"),
+        ({"inner": {"size": True}}, "inner.size must be a whole number, not True"),
+        ({"inner": {"size": 3}, "sizes": [1, 2.0]}, "sizes[1] must be a whole number, not 2.0"),
+        ({"inner": {"size": 3}, "sizes": 1}, "sizes must be a list, not 1"),
+        ({"inner": {"size": 3}, "by_name": {"a": 1}}, "by_name.a must be true or false, not 1"),
+        ({"inner": {"size": 3}, "rate": "fast"}, "rate must be a number, not 'fast'"),
+        ({"inner": {"size": 3}, "rate": 10**400}, "rate must be a number, not 1000"),
+        ({"inner": {"size": 3}, "rate": -1.0}, "rate must not be negative"),
+        ({"inner": {"size": 3, "szie": 4}}, "unknown key in inner 'szie'; allowed: size"),
+        ([1], "the content must be key: value pairs, not [1]"),
+    ],
+)
+def test_typed_refuses_what_they_do_not(content: object, line: str) -> None:
+    with pytest.raises(TsbenchError) as caught:
+        typed(Outer, content, "")
+    assert line in str(caught.value)

@@ -1,0 +1,452 @@
+"""The command line: a table of verbs, each of which imports what it needs when it is used."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from tsbench.core.errors import Stopped, TsbenchError, unknown
+from tsbench.gl import find_working_backend
+
+RUN_HELP = """\
+usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
+
+Trains a policy, evaluates it on the original task and leaves a run directory that explains itself.
+
+words, in Hydra's grammar:
+  task=NAME        what to solve; `tsbench list` names them
+  method=NAME      what solves it (twostage)
+  budget=NAME      smoke: seconds, fast: the standard, paper: the published one (fast)
+  seed=N           everything random comes from it (0)
+  directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
+  threads=N        CPU threads (all)
+  checkpoint=S     seconds of training between checkpoints (30)
+  resume=RUN       goes on with an interrupted run, to the same bits; alone, without other words
+  method.KEY=...   an option of the method
+  task.training.STAGE.KEY=...
+                   a PPO setting of the plan, imitate, finetune or task stages
+  task.constants.KEY=...
+                   a constant of the task, for studies: such a score cannot be ranked
+
+options:
+  --cfg job        show the configuration and stop
+  --json FILE      write the score to a new JSON file too, as `tsbench evaluate` does
+  -m, --multirun   a sweep: every combination of the values given, e.g. seed=0,1,2 task=a,b
+  --hydra-help     Hydra's own flags; -sc install=bash prints the shell completion
+
+examples:
+  tsbench run task=rocket_navigation budget=smoke
+  tsbench run -m task=laikago_walk,laikago_trot 'seed=range(0,3)'
+"""
+
+
+JSON_HELP = "write what is shown to a new JSON file too"
+PICTURES = ("--video", "--strip")  # what OpenGL draws
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise TsbenchError(f"{message} (see {self.prog} --help)")
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A command: what it does in a few words, and the function that takes its arguments."""
+
+    summary: str
+    call: Callable[[Sequence[str]], int | None]  # the exit status, None for 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command and returns the exit status: 0, 1 where a score is not what it was, 2 for a
+    user's mistake, 130 for Ctrl-C, 143 for SIGTERM."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        status = _dispatch(words)
+        sys.stdout.flush()
+    except TsbenchError as error:
+        return _fail(str(error), 2)
+    except Stopped as stopped:
+        return _fail(str(stopped), 128 + stopped.signal)
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    except BrokenPipeError:  # the reader of the output has left: `tsbench list | head -1`
+        _drop_output()
+        return 1
+    except OSError as error:  # a file that nobody took care of, or the output itself
+        _drop_output()
+        return _fail(f"{error.filename or 'output'}: {error.strerror or error}", 2)
+    return status
+
+
+def _fail(line: str, status: int) -> int:
+    sys.stderr.write(f"tsbench: {line}\n")
+    return status
+
+
+def _drop_output() -> None:
+    """What is still in the buffer has nowhere to go; Python would say so at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        sys.stdout.write(_help())
+    elif words[0] == "--version":
+        sys.stdout.write(f"tsbench {version('tsbench')}\n")
+    elif words[0] in ("-sc", "--shell-completion"):
+        _complete(words)
+    elif words[0] in VERBS:
+        if words[0] == "view" and any(w.startswith(PICTURES) for w in words):
+            find_working_backend()
+        _check_graphics()
+        return VERBS[words[0]].call(words[1:]) or 0
+    else:
+        raise unknown("command", words[0], VERBS)
+    return 0
+
+
+def _check_graphics() -> None:
+    """mujoco chooses OpenGL when it is imported, and fails if MUJOCO_GL names none that works."""
+    try:
+        import mujoco  # noqa: F401
+    except Exception as error:
+        setting = os.environ.get("MUJOCO_GL", "")
+        reason = str(error).partition("\n")[0]
+        raise TsbenchError(f"mujoco does not start with MUJOCO_GL={setting}: {reason}") from error
+
+
+def _help() -> str:
+    verbs = "\n".join(f"  {name:<10}{verb.summary}" for name, verb in VERBS.items())
+    return f"""\
+usage: tsbench COMMAND ...
+
+Sparse-reward robot tasks, as a planning MDP and as a physics MDP, and the methods that solve them.
+
+commands (each with --help):
+{verbs}
+
+first steps:
+  tsbench list
+  tsbench run task=rocket_navigation budget=smoke
+"""
+
+
+def _run(words: Sequence[str]) -> None:
+    if "-h" in words or "--help" in words:
+        sys.stdout.write(RUN_HELP)
+        return
+    from tsbench.cli import launch
+
+    parser = Parser("tsbench run", add_help=False, allow_abbrev=False)
+    parser.add_argument("--json", type=_new_file)
+    options, others = parser.parse_known_args(words)
+    launch.launch(others, options.json)
+
+
+def _complete(words: Sequence[str]) -> None:
+    """Shell completion: Hydra's, which knows nothing of verbs, with the verb taken out."""
+    line = os.environ.get("COMP_LINE", "").split(" ")
+    if "install" not in words[-1] and (len(line) < 3 or line[1] != "run"):
+        sys.stdout.write(" ".join(VERBS) + "\n")
+        return
+    os.environ["COMP_LINE"] = " ".join(line[:1] + line[2:])
+    from tsbench.cli import launch
+
+    launch.launch(words)
+
+
+def _list(words: Sequence[str]) -> None:
+    parser = _parser("list")
+    options = parser.parse_args(words)
+    from tsbench import methods, tasks
+    from tsbench.core import plugins
+    from tsbench.core.files import write_json
+    from tsbench.runs import config
+
+    made = {name: tasks.make(name) for name in tasks.names()}
+    budgets = {name: config.budgets(name) for name in made}
+    rows = {
+        name: {
+            "version": task.version,
+            "steps": task.horizon,
+            "seconds": round(task.horizon * task.timestep, 6),
+            "budgets": {budget: vars(steps) for budget, steps in budgets[name].items()},
+        }
+        for name, task in made.items()
+    }
+    summaries = {name: methods.summary(name) for name in methods.names()}
+    brought: dict[str, list[str]] = {}
+    for kind, names in ((tasks, rows), (methods, summaries)):
+        for name in names:
+            if (provider := kind.provider(name)) not in (None, plugins.own()):
+                brought.setdefault(str(provider), []).append(name)
+    refused = tuple(dict.fromkeys((*tasks.refused(), *methods.refused())))
+    offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for header in ("task", "version", "seconds", *offered):
+        table.add_column(header, no_wrap=True)
+    for name, row in rows.items():
+        amounts = [budgets[name].get(budget) for budget in offered]
+        costs = [f"{_short(a.plan)} + {_short(a.act)}" if a else "-" for a in amounts]
+        table.add_row(name, str(row["version"]), f"{row['seconds']:g}", *costs)
+    console = Console()
+    console.print(table)
+    console.print("Budgets: environment steps to plan with + to act with.")
+    table = Table("method", "what it does", box=SIMPLE_HEAD, pad_edge=False)
+    for name, summary in summaries.items():
+        table.add_row(name, summary)
+    console.print(table)
+    lines = [f"Plug-in {provider}: {', '.join(names)}" for provider, names in brought.items()]
+    for line in (*lines, *(f"Refused: {line}" for line in refused)):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    shown = {"tasks": rows, "methods": summaries, "plug-ins": brought, "refused": refused}
+    write_json(options.json, shown)
+
+
+def _short(steps: int) -> str:
+    """Thousands as k, millions as M, to three digits."""
+    for size, letter in ((1_000_000, "M"), (1_000, "k")):
+        if steps >= size:
+            return f"{steps / size:.3g}{letter}"
+    return str(steps)
+
+
+def _parser(verb: str, *, json: bool = True) -> Parser:
+    summary = VERBS[verb].summary
+    parser = Parser(f"tsbench {verb}", description=summary, allow_abbrev=False)
+    if json:
+        parser.add_argument("--json", type=_new_file, metavar="FILE", help=JSON_HELP)
+    return parser
+
+
+def _new_file(word: str) -> Path:
+    """A path that can be written: what took hours must not be lost at its end."""
+    from tsbench.core.files import check_new
+
+    path = Path(word)
+    check_new(path)
+    return path
+
+
+def _evaluate(words: Sequence[str]) -> int:
+    parser = _parser("evaluate")
+    parser.add_argument(
+        "policy",
+        metavar="POLICY_OR_RUN",
+        help="directory with a policy in it, .onnx file, stable-baselines3 .zip, zero or random",
+    )
+    parser.add_argument("task", nargs="?", metavar="task=NAME", help="where the policy says none")
+    parser.add_argument(
+        "--protocol",
+        metavar="NAME",
+        help="v1 or smoke, which takes seconds (as the run was scored, else v1)",
+    )
+    parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
+    parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
+    help_keep = "copy a finished run and this score into a new directory, as leaderboards/ has it"
+    parser.add_argument("--keep", type=Path, metavar="DIRECTORY", help=help_keep)
+    options = parser.parse_args(words)
+    from tsbench import tasks
+    from tsbench.cli import tables
+    from tsbench.core.files import write_json
+    from tsbench.evaluation.evaluate import evaluate
+    from tsbench.evaluation.protocol import PROTOCOLS, V1
+    from tsbench.evaluation.replay import compare
+    from tsbench.runs import directory as record
+    from tsbench.runs.progress import progress_bar
+
+    path = Path(options.policy)
+    policy, task = _policy(path, options.task, options.trust_sb3)
+    run = record.RunDirectory(path)
+    kept = run.record() if run.finished else None
+    name = options.protocol or (kept.score.protocol if kept else V1.name)
+    if name not in PROTOCOLS:
+        raise unknown("protocol", name, PROTOCOLS)
+    protocol = PROTOCOLS[name]
+    log = run.actions() if kept else None
+    if options.keep is not None:
+        record.check_keep(run, options.keep, protocol)
+    console, standard = Console(), tasks.standard(task)
+    with progress_bar(console, "evaluate") as progress:
+        score = evaluate(
+            policy, task, protocol=protocol, threads=options.threads, progress=progress
+        )
+    console.print(tables.score_table(f"{task.name}: {options.policy}", score))
+    tables.show_rank(console, standard, score)
+    shown: dict[str, Any] = {**score.as_dict(), "standard": standard}
+    agrees = None
+    if kept is not None:
+        comparison = compare(kept.score, score, task, log)
+        agrees = comparison.agrees
+        shown = record.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
+        line = f" {run.score_file}: {comparison.words}"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    write_json(options.json, shown)
+    if agrees is False:
+        if options.keep is not None:
+            console.print(" not kept: the score is not what it was", highlight=False)
+        return 1
+    if options.keep is not None:
+        record.keep(run, options.keep, score)
+        console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
+    return 0
+
+
+def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
+    """A policy and the task to evaluate it in.
+
+    Raises:
+        TsbenchError: there is no such policy, or the word for the task is missing or wrong.
+    """
+    from tsbench import tasks
+    from tsbench.evaluation import foreign as adapters
+    from tsbench.evaluation import references
+    from tsbench.runs.directory import RunDirectory
+
+    name = None
+    if word is not None:
+        key, separator, name = word.partition("=")
+        if key != "task" or not separator:
+            raise TsbenchError(f"expected task=NAME, not {word!r}")
+        if name not in tasks.names():
+            raise unknown("task", name, tasks.names())
+    if trust_sb3 is not None and path.suffix != ".zip":
+        raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
+    if path.is_dir():
+        run = RunDirectory(path)
+        policy = run.policy()
+        task = run.task(policy.info.task)
+        if name not in (None, task.name):
+            raise TsbenchError(f"{path} holds a policy for {task.name}, not for {name}")
+        return policy, task
+    if name is None:
+        if path.exists() or str(path) in references.POLICIES:
+            raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
+        raise TsbenchError(f"no run directory {path}")
+    task = tasks.make(name)
+    return references.named(path, task) or adapters.load(path, task, trust_sb3), task
+
+
+def _threads(word: str) -> int:
+    return _whole_number(word, 1, 1024)
+
+
+def _whole_number(word: str, lowest: int, highest: int) -> int:
+    if not (word.isdecimal() and lowest <= int(word) <= highest):
+        message = f"must be a whole number from {lowest} to {highest}, not {word!r}"
+        raise argparse.ArgumentTypeError(message)
+    return int(word)
+
+
+def _view(words: Sequence[str]) -> None:
+    parser = _parser("view", json=False)
+    what = "a run's directory, a plan's file (plan.npz), or task=NAME"
+    parser.add_argument("what", nargs="?", metavar="RUN|PLAN|task=NAME", help=what)
+    parser.add_argument("--compare", nargs=2, metavar="RUN", help="two runs of one task instead")
+    push = "push the robot for 0.1 s, e.g. 100N@0.5s:+y: newtons, when, where to (axis or degrees)"
+    parser.add_argument("--push", metavar="PUSH", help=push)
+    files = {
+        "--html": "write a page, open no server",
+        "--video": "write an MP4",
+        "--strip": "write a PNG of some moments",
+    }
+    for flag, purpose in files.items():
+        parser.add_argument(flag, type=_new_file, metavar="FILE", help=purpose)
+    port = "of the live view (any that is free)"
+    parser.add_argument("--port", type=_port, metavar="N", default=0, help=port)
+    options = parser.parse_args(words)
+    if (options.what is None) == (options.compare is None):
+        parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
+    from tsbench.core.files import write_new
+    from tsbench.viewer import film, page, serve
+    from tsbench.viewer.show import Show
+    from tsbench.viewer.subject import pair, subject
+
+    def show(push: str | None) -> Show:
+        return pair(options.compare, push) if options.compare else subject(options.what).show(push)
+
+    shown = show(options.push)
+    if options.html:
+        write_new(options.html, page.render(shown).encode())
+    if options.video:
+        film.write_video(shown, options.video)
+    if options.strip:
+        film.write_strip(shown, options.strip)
+    written = [str(path) for path in (options.html, options.video, options.strip) if path]
+    if written:
+        sys.stdout.write("\n".join(written) + "\n")
+        return
+    running = serve.server(lambda push: page.render(show(push), served=True), options.port)
+    sys.stdout.write(f"{serve.address(running, options.push)} (Ctrl-C ends it)\n")
+    sys.stdout.flush()
+    # A shell lets what it starts in the background ignore Ctrl-C; a server must still end by it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with running, suppress(KeyboardInterrupt):
+        running.serve_forever()
+
+
+def _port(word: str) -> int:
+    return _whole_number(word, 0, 65535)
+
+
+def _report(words: Sequence[str]) -> None:
+    parser = _parser("report", json=False)
+    parser.add_argument("run", type=Path, metavar="RUN", help="a finished run's directory")
+    what = "the page to write, a new one (what RUN lacks of its report.html and view.html)"
+    parser.add_argument("--html", type=Path, metavar="FILE", help=what)
+    options = parser.parse_args(words)
+    from tsbench.core.files import check_new, write_new
+    from tsbench.runs.directory import RunDirectory
+    from tsbench.viewer import report
+
+    run = RunDirectory(options.run)
+    report.check_finished(run)
+    path = options.html or run.report_file
+    check_new(path, "give another by --html FILE")
+    if options.html:
+        write_new(path, report.render(run).encode())
+    else:
+        report.write_pages(run)
+    sys.stdout.write(f"{path}\n")
+
+
+def _bench(words: Sequence[str]) -> None:
+    parser = _parser("bench")
+    parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago or sb3")
+    parser.add_argument("--quick", action="store_true", help="a minute, with larger ranges")
+    options = parser.parse_args(words)
+    from tsbench import bench
+    from tsbench.bench import table
+    from tsbench.core.files import write_json
+
+    progress = Console(stderr=True)
+    findings = bench.measure(
+        options.only, quick=options.quick, tell=lambda name: progress.print(f"measuring {name}")
+    )
+    table.show(Console(), findings)
+    write_json(options.json, findings.as_dict())
+
+
+VERBS = {
+    "run": Verb("train a policy and evaluate it", _run),
+    "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
+    "view": Verb("see a run, a plan or a task move: live, as a page or as a video", _view),
+    "report": Verb("write one page about a run: what was planned, done and learned", _report),
+    "bench": Verb("measure how fast it is, side by side with others", _bench),
+    "list": Verb("name the tasks, methods and budgets", _list),
+}

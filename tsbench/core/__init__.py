@@ -1,0 +1,1 @@
+"""What everyone may know: the words that tasks, learners and evaluations share."""

@@ -1,0 +1,288 @@
+"""Plans and reference motions: what passes from the planning stage to the imitation stage."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from tsbench.core.arrays import Array, array_namespace, step_of
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import write_whole
+
+# What numpy and zipfile raise on files that are not what they should be. RuntimeError covers
+# encrypted members and unknown compression methods.
+_DAMAGE = (
+    OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, MemoryError, OverflowError,
+    zlib.error, zipfile.BadZipFile, struct.error,
+)  # fmt: skip
+
+
+_ORIGIN = ("task", "task_version", "timestep")  # what every recording says of itself
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """Arrays over time with their origin, kept in one npz file that holds no code."""
+
+    kind: ClassVar[str]
+    dimensions: ClassVar[dict[str, int]]  # of each array, by its name
+
+    task: str
+    task_version: int
+    timestep: float
+
+    def __post_init__(self) -> None:
+        problem = self._problem()
+        if problem:
+            raise TsbenchError(f"not a valid {self.kind}: {problem}")
+
+    def _problem(self) -> str | None:
+        for name, kind in (("task", str), ("task_version", int), ("timestep", float)):
+            if type(getattr(self, name)) is not kind:
+                return f"{name} must be {kind.__name__}, not {getattr(self, name)!r}"
+        if not (np.isfinite(self.timestep) and self.timestep > 0.0):
+            return f"the time step is {self.timestep}, it must be positive"
+        for name, ndim in self.dimensions.items():
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.ndim != ndim:
+                return f"{name} must be an array of {ndim} dimensions"
+            if array.dtype != np.float64:
+                return f"{name} is of type {array.dtype}"
+        for name, array in self.arrays.items():
+            if array.dtype.kind == "f" and not np.all(np.isfinite(array)):
+                return f"{name} holds values that are not finite"
+        return None
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of its arrays by name, time as their first axis."""
+        return {name: getattr(self, name) for name in self.dimensions}
+
+    def save(self, path: Path | str) -> None:
+        """Writes the recording; the file appears whole or not at all."""
+        content = io.BytesIO()
+        np.savez_compressed(content, allow_pickle=False, kind=self.kind, **self._content())
+        write_whole(Path(path), content.getvalue())
+
+    def _content(self) -> dict[str, Any]:
+        """What the file holds, by name."""
+        return {**{name: getattr(self, name) for name in _ORIGIN}, **self.arrays}
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads a recording.
+
+        Raises:
+            TsbenchError: the file is missing, damaged, or of another kind.
+        """
+        content = _content(Path(path), cls.kind)
+        found = str(content.pop("kind", "unknown"))
+        if found != cls.kind:
+            raise TsbenchError(f"{path} is not a {cls.kind} file (it says: {found})")
+        try:
+            return cls._from_content({name: _plain(value) for name, value in content.items()})
+        except (TsbenchError, TypeError, ValueError, AttributeError) as error:
+            raise TsbenchError(f"damaged {cls.kind} file {path}: {error}") from None
+
+    @classmethod
+    def _from_content(cls, content: dict[str, Any]) -> Self:
+        """
+        Raises:
+            TsbenchError: values are missing, unknown or wrong.
+        """
+        names = {field.name for field in dataclasses.fields(cls)}
+        if differing := names ^ set(content):
+            raise TsbenchError(f"missing or unknown {', '.join(sorted(differing))}")
+        return cls(**content)
+
+
+def _content(path: Path, kind: str) -> dict[str, np.ndarray]:
+    """The arrays of a recording's file.
+
+    Raises:
+        TsbenchError: the file is missing or damaged.
+    """
+    try:
+        if path.is_file() and not zipfile.is_zipfile(path):
+            raise TsbenchError(f"damaged {kind} file {path}: it is no npz file")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise TsbenchError(f"no {kind} at {path}") from None
+    except _DAMAGE as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise TsbenchError(f"damaged {kind} file {path}: {reason}") from None
+
+
+def _plain(value: np.ndarray) -> Any:
+    return value.item() if value.ndim == 0 else value
+
+
+@dataclass(frozen=True)
+class Plan(_Recording):
+    """The abstract trajectory of the planning stage.
+
+    Attributes:
+        states: abstract coordinates (`Abstraction.coordinates`), shape (T + 1, n).
+        rewards: planning reward of each step, shape (T,).
+    """
+
+    kind: ClassVar[str] = "plan"
+    dimensions: ClassVar[dict[str, int]] = {"states": 2, "rewards": 1}
+
+    states: np.ndarray
+    rewards: np.ndarray
+
+    def _problem(self) -> str | None:
+        if problem := super()._problem():
+            return problem
+        if len(self.states) != len(self.rewards) + 1 or len(self.states) < 2:
+            return f"{len(self.states)} states and {len(self.rewards)} rewards do not match"
+        return None
+
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds of each state, shape (T + 1,)."""
+        return np.arange(len(self.states)) * self.timestep
+
+
+@dataclass(frozen=True)
+class ReferenceMotion(_Recording):
+    """A plan as full poses at the control rate.
+
+    Attributes:
+        qpos: generalised positions, shape (T + 1, nq).
+        qvel: generalised velocities by central differences, shape (T + 1, nv).
+        tracked: what else the task's imitation reward compares, by name, each (T + 1, ...), of
+            numbers or booleans (`Plannable.tracked`).
+    """
+
+    kind: ClassVar[str] = "reference motion"
+    dimensions: ClassVar[dict[str, int]] = {"qpos": 2, "qvel": 2}
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    tracked: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    def _problem(self) -> str | None:
+        for name, array in self.tracked.items():
+            if not isinstance(array, np.ndarray) or array.ndim < 1:
+                return f"{name} must be an array over time"
+            if array.dtype not in (np.float64, np.bool_):
+                return f"{name} is of type {array.dtype}"
+        if problem := super()._problem():
+            return problem
+        lengths = {name: len(array) for name, array in self.arrays.items()}
+        if len(set(lengths.values())) != 1 or lengths["qpos"] < 2:
+            return f"the lengths do not match: {lengths}"
+        return None
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {**super().arrays, **self.tracked}
+
+    def _content(self) -> dict[str, Any]:
+        return {**super()._content(), "tracked": np.array(sorted(self.tracked), np.str_)}
+
+    @classmethod
+    def _from_content(cls, content: dict[str, Any]) -> Self:
+        named = content.pop("tracked", None)
+        if not isinstance(named, np.ndarray) or named.dtype.kind != "U" or named.ndim != 1:
+            raise TsbenchError("missing the names of what is tracked")
+        tracked = {name: content.pop(name) for name in named.tolist() if name in content}
+        if missing := set(named.tolist()) - tracked.keys():
+            raise TsbenchError(f"missing or unknown {', '.join(sorted(missing))}")
+        return super()._from_content({**content, "tracked": tracked})
+
+    @property
+    def steps(self) -> int:
+        return len(self.qpos) - 1
+
+    @property
+    def duration(self) -> float:
+        """Seconds."""
+        return self.steps * self.timestep
+
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds of each frame, shape (T + 1,)."""
+        return np.arange(self.steps + 1) * self.timestep
+
+    def frame(self, time: Array) -> Array:
+        """Index of the frame at each time in seconds; the last one beyond the end."""
+        return array_namespace(time).clip(step_of(time, self.timestep), 0, self.steps)
+
+
+def read_motion(path: Path | str) -> Plan | ReferenceMotion:
+    """Reads a plan or a reference motion, whichever the file holds.
+
+    Raises:
+        TsbenchError: the file is missing, damaged, or neither.
+    """
+    found = str(_content(Path(path), "plan").get("kind"))
+    return ReferenceMotion.load(path) if found == ReferenceMotion.kind else Plan.load(path)
+
+
+@dataclass(frozen=True)
+class ActionLog(_Recording):
+    """What a policy did in some episodes, to replay their physics from.
+
+    Attributes:
+        actions: of the nominal and then the perturbed episodes, shape (T, n, action_size).
+        rewards: that they earned, shape (T, n); zero once an episode has ended.
+    """
+
+    kind: ClassVar[str] = "action log"
+    dimensions: ClassVar[dict[str, int]] = {"actions": 3, "rewards": 2}
+
+    actions: np.ndarray
+    rewards: np.ndarray
+
+    def _problem(self) -> str | None:
+        if problem := super()._problem():
+            return problem
+        if self.actions.shape[:2] != self.rewards.shape:
+            return f"actions {self.actions.shape} and rewards {self.rewards.shape} do not match"
+        return None
+
+
+@dataclass(frozen=True)
+class AuditItem:
+    """One measured property of a plan or reference motion against what is allowed."""
+
+    what: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        return bool(self.value <= self.limit)
+
+    def __str__(self) -> str:
+        verdict = "ok" if self.passed else "TOO MUCH"
+        return f"{self.what}: {self.value:.3g} {self.unit} (at most {self.limit:.3g}) {verdict}"
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Whether a plan can be followed at all, in plain words."""
+
+    items: tuple[AuditItem, ...]
+
+    @property
+    def passed(self) -> bool:
+        return all(item.passed for item in self.items)
+
+    @property
+    def failures(self) -> tuple[AuditItem, ...]:
+        return tuple(item for item in self.items if not item.passed)

@@ -1,0 +1,208 @@
+"""The policy artefact: data that a short numpy forward pass turns into actions.
+
+`policy.safetensors` holds the weights, `policy.json` says what they mean. Neither can execute
+code, and running them needs no torch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from tsbench.core.errors import TsbenchError, unknown
+from tsbench.core.files import write_whole
+from tsbench.core.typed import typed
+
+FORMAT = 1
+
+
+def _elu(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))
+
+
+def _relu(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, 0.0)
+
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "elu": _elu,
+    "relu": _relu,
+    "tanh": np.tanh,
+}
+
+
+def _plain(x: np.ndarray) -> np.ndarray:
+    return x
+
+
+def _symlog(x: np.ndarray) -> np.ndarray:
+    return np.sign(x) * np.log1p(np.abs(x))
+
+
+# What is done to observations before they are normalised. Where some range over tens of metres and
+# decimetres still matter, as a rocket's way to its goal, `symlog` (Hafner et al. 2023, DreamerV3)
+# spreads the small values apart.
+ENCODINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"plain": _plain, "symlog": _symlog}
+
+
+@dataclass(frozen=True)
+class PolicyInfo:
+    """What `policy.json` says.
+
+    Attributes:
+        task: name of the task it was trained for.
+        task_version: of that task.
+        physics: fingerprint of the task's MJCF (`sim.model.fingerprint`).
+        method: what trained it.
+        activation: between layers, a name in `ACTIVATIONS`.
+        layers: sizes from observation to action.
+        sha256: of `policy.safetensors`.
+        encoding: of observations before they are normalised, a name in `ENCODINGS`.
+        format: of these files.
+    """
+
+    task: str
+    task_version: int
+    physics: str
+    method: str
+    activation: str
+    layers: tuple[int, ...]
+    sha256: str = ""
+    encoding: str = "plain"
+    format: int = FORMAT
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A multilayer perceptron with its observation normaliser: observation -> action.
+
+    Attributes:
+        info: where it comes from.
+        mean: of the encoded observations in training, shape (n,), float32.
+        scale: what deviations from the mean are divided by, shape (n,), float32.
+        weights: of each layer, shape (outputs, inputs), float32.
+        biases: of each layer, shape (outputs,), float32.
+    """
+
+    info: PolicyInfo
+    mean: np.ndarray
+    scale: np.ndarray
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Actions (..., m) in [-1, 1] for observations (..., n), deterministic.
+
+        Each row is computed by itself: matrix products over several rows round differently, and
+        an action must not depend on what else is in the batch.
+        """
+        activation = ACTIVATIONS[self.info.activation]
+        encoded = ENCODINGS[self.info.encoding](np.asarray(observation, np.float32))
+        x = (encoded - self.mean) / self.scale
+        last = len(self.weights) - 1
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = (weight @ x[..., None])[..., 0] + bias  # a product of its own for every row
+            if i < last:
+                x = activation(x)
+        return np.clip(x, -1.0, 1.0).astype(np.float64)
+
+    def _content(self) -> bytes:
+        """Of `policy.safetensors`."""
+        tensors = {"mean": self.mean, "scale": self.scale}
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            tensors[f"weight_{i}"] = np.ascontiguousarray(weight)
+            tensors[f"bias_{i}"] = np.ascontiguousarray(bias)
+        return save(tensors)
+
+    @property
+    def sha256(self) -> str:
+        """Of `policy.safetensors`, saved or not."""
+        return hashlib.sha256(self._content()).hexdigest()
+
+    def save(self, directory: Path | str) -> None:
+        """Writes policy.safetensors and policy.json into the directory."""
+        directory = Path(directory)
+        content = self._content()
+        info = asdict(self.info) | {"sha256": hashlib.sha256(content).hexdigest()}
+        write_whole(directory / "policy.safetensors", content)
+        write_whole(directory / "policy.json", (json.dumps(info, indent=2) + "\n").encode())
+
+    @classmethod
+    def load(cls, directory: Path | str) -> Policy:
+        """Reads what `save` wrote.
+
+        Raises:
+            TsbenchError: a file is missing or damaged, or they do not belong together.
+        """
+        directory = Path(directory)
+        info = _read_info(directory / "policy.json")
+        path = directory / "policy.safetensors"
+        content = _read(path)
+        if hashlib.sha256(content).hexdigest() != info.sha256:
+            raise TsbenchError(f"{path} is not the file that policy.json describes (hash differs)")
+        try:
+            tensors = load(content)
+            count = len(info.layers) - 1
+            expected_names = {"mean", "scale"}
+            expected_names |= {f"{kind}_{i}" for kind in ("weight", "bias") for i in range(count)}
+            if differing := sorted(set(tensors) ^ expected_names):
+                raise ValueError(f"missing or unknown tensors: {', '.join(differing)}")
+            for name, tensor in tensors.items():
+                if tensor.dtype != np.float32:
+                    raise ValueError(f"{name} is of type {tensor.dtype}, not float32")
+            policy = cls(
+                info=info,
+                mean=tensors["mean"],
+                scale=tensors["scale"],
+                weights=tuple(tensors[f"weight_{i}"] for i in range(count)),
+                biases=tuple(tensors[f"bias_{i}"] for i in range(count)),
+            )
+        except (SafetensorError, KeyError, ValueError) as error:
+            raise TsbenchError(f"damaged policy file {path}: {error}") from None
+        shapes = [policy.mean.shape, policy.scale.shape]
+        shapes += [weight.shape for weight in policy.weights]
+        shapes += [bias.shape for bias in policy.biases]
+        sizes = info.layers
+        expected: list[tuple[int, ...]] = [(sizes[0],), (sizes[0],)]
+        expected += list(zip(sizes[1:], sizes[:-1], strict=True))
+        expected += [(size,) for size in sizes[1:]]
+        if shapes != expected:
+            raise TsbenchError(f"damaged policy file {path}: shapes do not fit the layers {sizes}")
+        if not all(np.all(np.isfinite(tensor)) for tensor in tensors.values()):
+            raise TsbenchError(f"damaged policy file {path}: values that are not finite")
+        if np.any(policy.scale <= 0.0):
+            raise TsbenchError(f"damaged policy file {path}: the scale must be positive")
+        return policy
+
+
+def _read_info(path: Path) -> PolicyInfo:
+    content = _read(path)
+    try:
+        info: PolicyInfo = typed(PolicyInfo, json.loads(content), "")
+    except (ValueError, RecursionError, TsbenchError) as error:
+        raise TsbenchError(f"damaged policy file {path}: {error}") from None
+    if info.format != FORMAT:
+        raise TsbenchError(f"{path} has format {info.format}; this tsbench reads {FORMAT}")
+    if info.activation not in ACTIVATIONS:
+        raise unknown(f"activation in {path}", str(info.activation), ACTIVATIONS)
+    if info.encoding not in ENCODINGS:
+        raise unknown(f"encoding in {path}", str(info.encoding), ENCODINGS)
+    if len(info.layers) < 2 or min(info.layers) < 1:
+        raise TsbenchError(f"damaged policy file {path}: layers {info.layers}")
+    return info
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise TsbenchError(f"no policy file {path}") from None
+    except OSError as error:
+        raise TsbenchError(f"cannot read {path}: {error.strerror}") from None

@@ -1,0 +1,95 @@
+"""What passes between a task and what steps it: states, starts and sensor readings."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self, TypeVar
+
+import numpy as np
+
+from tsbench.core.arrays import Array, array_namespace
+
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class State:
+    """What a task knows at one time step; every field has the same leading batch axes.
+
+    Attributes:
+        time: seconds since the start of the episode, shape (...,).
+    """
+
+    time: Array
+
+    def replace(self, **changes: Array) -> Self:
+        return dataclasses.replace(self, **changes)
+
+    def updated(self, rows: Array, other: Self) -> Self:
+        """This state with the states of `other` in place of `rows` (first batch axis)."""
+
+        def merge(field: dataclasses.Field[Any]) -> Array:
+            old = getattr(self, field.name)
+            values = array_namespace(old).asarray(old, copy=True)
+            values[rows] = getattr(other, field.name)
+            return values
+
+        return self.replace(**{f.name: merge(f) for f in dataclasses.fields(self)})
+
+    def rows(self, rows: Array | slice) -> Self:
+        """The states of some members of the batch (first batch axis)."""
+        return self.replace(
+            **{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)}
+        )
+
+
+S = TypeVar("S", bound=State)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where episodes begin.
+
+    Attributes:
+        time: seconds, shape (n,). Zero but in training that starts along a reference motion.
+        qpos: generalised positions, shape (n, nq).
+        qvel: generalised velocities, shape (n, nv).
+        memory: what `Plant.control` remembers, shape (n, m).
+    """
+
+    time: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    memory: np.ndarray
+
+    def rows(self, rows: np.ndarray | slice) -> Start:
+        """Some of the starts."""
+        return Start(self.time[rows], self.qpos[rows], self.qvel[rows], self.memory[rows])
+
+    @classmethod
+    def joined(cls, starts: Sequence[Start]) -> Start:
+        """All of them, one after the other."""
+        fields = [field.name for field in dataclasses.fields(cls)]
+        return cls(*(np.concatenate([getattr(start, f) for start in starts]) for f in fields))
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What the physics tells the task after a control step.
+
+    Attributes:
+        time: seconds since the start of the episode, shape (...,).
+        qpos: generalised positions, shape (..., nq).
+        qvel: generalised velocities, shape (..., nv).
+        sensors: the MJCF's sensors by name, each (..., dim), current at qpos and qvel. Only
+            position and velocity sensors are: those of the acceleration stage lag a substep.
+        memory: what `Plant.control` remembers, shape (..., m).
+    """
+
+    time: Array
+    qpos: Array
+    qvel: Array
+    sensors: Mapping[str, Array]
+    memory: Array

@@ -1,0 +1,83 @@
+"""Plain values, as YAML and JSON give them, into dataclasses."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from tsbench.core.errors import TsbenchError, unknown
+
+
+def typed(kind: Any, value: Any, path: str) -> Any:
+    """A plain value as a dataclass, container or scalar of the type asked for.
+
+    Numbers are never rounded, nor text read as numbers; a whole number is a valid float.
+
+    Args:
+        kind: a type annotation.
+        value: what YAML or JSON gave.
+        path: the dotted key, for messages.
+
+    Raises:
+        TsbenchError: a key is missing or unknown, or a value has the wrong type or range.
+    """
+    if is_dataclass(kind) and isinstance(kind, type):
+        given = typed_items(kind, value, path)
+        for entry in fields(kind):
+            if entry.name not in given and entry.default is entry.default_factory is MISSING:
+                raise TsbenchError(f"{_join(path, entry.name)} is missing")
+        try:
+            return kind(**given)
+        except ValueError as error:  # from __post_init__
+            raise TsbenchError(_join(path, str(error))) from None
+    if kind is Any:
+        return value
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType) and type(None) in arguments:
+        (rest,) = (argument for argument in arguments if argument is not type(None))
+        return None if value is None else typed(rest, value, path)
+    if origin in (dict, Mapping) and isinstance(value, Mapping):
+        return {str(k): typed(arguments[1], v, _join(path, str(k))) for k, v in value.items()}
+    if origin in (list, tuple) and isinstance(value, (list, tuple)):
+        return origin(typed(arguments[0], v, f"{path}[{i}]") for i, v in enumerate(value))
+    if kind is float and type(value) is int and abs(value) < 2**1023:
+        return float(value)
+    if type(value) is kind:
+        return value
+    wanted = _WORDS.get(kind) or _WORDS.get(origin) or str(kind)
+    raise TsbenchError(f"{path or 'the content'} must be {wanted}, not {value!r}")
+
+
+def typed_items(kind: type, value: Any, path: str) -> dict[str, Any]:
+    """Those fields of a dataclass that are given, with their types. See `typed`."""
+    if not isinstance(value, Mapping):
+        raise TsbenchError(f"{path or 'the content'} must be key: value pairs, not {value!r}")
+    hints = get_type_hints(kind)
+    allowed = [entry.name for entry in fields(kind)]
+    for name in value:
+        if name not in allowed:
+            raise unknown_key(path, str(name), allowed)
+    return {str(n): typed(hints[str(n)], v, _join(path, str(n))) for n, v in value.items()}
+
+
+def unknown_key(path: str, name: str, allowed: Iterable[str]) -> TsbenchError:
+    """The error for a key that the mapping at `path` does not have."""
+    return unknown(f"key in {path}" if path else "key", name, allowed)
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+_WORDS = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    dict: "key: value pairs",
+    Mapping: "key: value pairs",
+    list: "a list",
+    tuple: "a list",
+}

@@ -1,0 +1,204 @@
+"""Policies that were not made here, as what the evaluation asks for.
+
+Each observation is answered by itself, whatever else is evaluated beside it: a network that sees
+many rows at once rounds differently, and an action must depend on its own observation alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tsbench.core.errors import TsbenchError, os_errors, unknown
+from tsbench.core.policy import Policy
+from tsbench.core.task import MDP
+
+ONNX_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # those with continuous actions
+
+
+@dataclass(frozen=True)
+class ForeignPolicy:
+    """Any function of an observation.
+
+    Attributes:
+        answer: observation (o,) -> action (a,).
+        observation_size: o.
+        action_size: a.
+        sha256: of the file it came from, or None.
+    """
+
+    answer: Callable[[np.ndarray], Any]
+    observation_size: int
+    action_size: int
+    sha256: str | None = None
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Actions (n, a) for observations (n, o).
+
+        Raises:
+            TsbenchError: an action has another shape, or values that are not finite.
+        """
+        return np.stack([self._act(row) for row in observation])
+
+    def _act(self, observation: np.ndarray) -> np.ndarray:
+        given = self.answer(observation)
+        try:
+            action = np.asarray(given, float)
+        except (TypeError, ValueError):
+            raise TsbenchError(f"the policy's action is not made of numbers: {given!r}") from None
+        if action.shape != (self.action_size,):
+            raise TsbenchError(
+                f"the policy's action has shape {action.shape}, not ({self.action_size},)"
+            )
+        if not np.all(np.isfinite(action)):
+            raise TsbenchError("the policy's action holds values that are not finite")
+        return action
+
+
+def from_function(function: Callable[[np.ndarray], Any], mdp: MDP[Any]) -> ForeignPolicy:
+    """A function of one observation (o,) that returns one action (a,), each in [-1, 1]."""
+    return ForeignPolicy(function, mdp.observation_size, mdp.action_size)
+
+
+def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
+    """An ONNX model whose input is (1, o) or (n, o) and whose first output is the actions.
+
+    An ONNX file is data; it cannot run code of its own.
+
+    Raises:
+        TsbenchError: onnxruntime is missing, or the file is damaged or of other sizes.
+    """
+    path = Path(path)
+    runtime = _extra("onnxruntime", "onnx")
+    content = _read(path)
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1  # the order of sums is then the same everywhere
+    try:
+        session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's own exceptions share no base class
+        raise TsbenchError(f"damaged ONNX file {path}: {_line(error)}") from None
+    inputs = session.get_inputs()
+    size = mdp.observation_size
+    # The number of rows is 1, or not fixed: a name or nothing.
+    fitting = [
+        one
+        for one in inputs
+        if one.type in ONNX_TYPES
+        and len(one.shape) == 2
+        and one.shape[1] == size
+        and (one.shape[0] == 1 or not isinstance(one.shape[0], int))
+    ]
+    if len(inputs) != 1 or not fitting:
+        given = ", ".join(f"{one.type} {one.shape}" for one in inputs)
+        raise TsbenchError(
+            f"{path} takes {given}, not one input of floats (n, {size}) for {mdp.name}"
+        )
+
+    kind, name = ONNX_TYPES[fitting[0].type], fitting[0].name
+
+    def answer(observation: np.ndarray) -> Any:
+        try:
+            first = session.run(None, {name: observation[None].astype(kind)})[0]
+        except Exception as error:  # as above
+            raise TsbenchError(f"{path} cannot be run: {_line(error)}") from None
+        shape = first.shape if isinstance(first, np.ndarray) else None
+        if shape is None or len(shape) != 2 or shape[0] != 1:
+            given = "no array" if shape is None else f"shape {shape}"
+            raise TsbenchError(f"{path} returns {given}, not (1, {mdp.action_size})")
+        return first[0]
+
+    return ForeignPolicy(
+        answer, mdp.observation_size, mdp.action_size, hashlib.sha256(content).hexdigest()
+    )
+
+
+def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
+    """A model that stable-baselines3 saved, acting deterministically.
+
+    Such a file can run any code when it is loaded: only load files of people you trust.
+
+    Raises:
+        TsbenchError: stable-baselines3 is missing, there is no such algorithm, or the file is
+            damaged or of other sizes.
+    """
+    path = Path(path)
+    if algorithm not in SB3_ALGORITHMS:
+        raise unknown("stable-baselines3 algorithm", algorithm, SB3_ALGORITHMS)
+    baselines = _extra("stable_baselines3", "sb3")
+    content = _read(path)
+    try:
+        model = getattr(baselines, algorithm).load(path, device="cpu")
+    except Exception as error:  # pickle, zipfile and torch raise anything
+        raise TsbenchError(f"damaged stable-baselines3 file {path}: {_line(error)}") from None
+    return from_sb3_model(model, mdp, str(path), hashlib.sha256(content).hexdigest())
+
+
+def from_sb3_model(
+    model: Any, mdp: MDP[Any], name: str = "the model", sha256: str | None = None
+) -> ForeignPolicy:
+    """A stable-baselines3 model that is there already, acting deterministically.
+
+    Raises:
+        TsbenchError: it is of other sizes.
+    """
+    sizes = (model.observation_space.shape, model.action_space.shape)
+    if sizes != ((mdp.observation_size,), (mdp.action_size,)):
+        raise TsbenchError(
+            f"{name} maps observations {sizes[0]} to actions {sizes[1]}, not "
+            f"({mdp.observation_size},) to ({mdp.action_size},) as {mdp.name} does"
+        )
+
+    def answer(observation: np.ndarray) -> Any:
+        return model.predict(observation.astype(np.float32), deterministic=True)[0]
+
+    return ForeignPolicy(answer, mdp.observation_size, mdp.action_size, sha256)
+
+
+def load(path: Path, mdp: MDP[Any], sb3: str | None = None) -> Policy | ForeignPolicy:
+    """A policy's directory, an ONNX file or a stable-baselines3 file.
+
+    Args:
+        path: of it.
+        mdp: that it is to act in.
+        sb3: the algorithm that saved the file, which says that whoever asks trusts it.
+
+    Raises:
+        TsbenchError: there is no such policy, it is damaged, or it does not fit.
+    """
+    if path.is_dir():
+        return Policy.load(path)
+    if not path.exists():
+        raise TsbenchError(f"no policy {path}")
+    if sb3 is not None:
+        return from_sb3(path, sb3, mdp)
+    if path.suffix == ".onnx":
+        return from_onnx(path, mdp)
+    if path.suffix == ".zip":
+        raise TsbenchError(
+            f"{path}: a stable-baselines3 file can run any code when it is loaded; "
+            f"if you trust it: --trust-sb3 {'|'.join(SB3_ALGORITHMS)}"
+        )
+    raise TsbenchError(f"{path} is neither a run directory nor an .onnx or .zip file")
+
+
+def _extra(package: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError:
+        raise TsbenchError(f"{package} is missing: pip install 'tsbench[{extra}]'") from None
+
+
+def _read(path: Path) -> bytes:
+    with os_errors(path):
+        return path.read_bytes()
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

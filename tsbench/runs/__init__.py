@@ -1,0 +1,1 @@
+"""Runs: a configuration in, a directory that explains itself out."""

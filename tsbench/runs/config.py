@@ -1,0 +1,247 @@
+"""The configuration of a run: `key=value` words, checked before anything starts.
+
+Hydra composes the words with the YAML files of `tsbench.conf` and of plug-ins; here the result gets
+its types, and whatever is wrong with it becomes one line.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from importlib.resources.abc import Traversable
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_module
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.errors import (
+    CompactHydraException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from tsbench.core import plugins
+from tsbench.core.errors import TsbenchError, unknown
+from tsbench.core.method import Budget
+from tsbench.core.typed import typed, unknown_key
+
+SEEDS = 2**32  # numpy and torch both take 32 bits
+CONFIGURATIONS = "tsbench.conf"
+VERSION_BASE = "1.3"  # the defaults of this Hydra release
+OPEN_MAPPINGS = ("task.training.", "task.constants.")
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """`conf/task/NAME.yaml`.
+
+    Attributes:
+        name: a registered task.
+        budgets: the budgets on offer, by name.
+        training: changes to the PPO settings by kind of stage (a method's `STAGES`).
+        constants: changed constants of the task, for studies; such a score cannot be ranked.
+    """
+
+    name: str
+    budgets: dict[str, Budget]
+    training: dict[str, dict[str, Any]] = field(default_factory=dict)
+    constants: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """`conf/config.yaml`.
+
+    Attributes:
+        task: the task's part.
+        method: the method's name and its options.
+        seed: in [0, 2**32).
+        budget: a name among the task's budgets.
+        directory: the run directory, or None for the standard place.
+        threads: CPU threads, or None for all.
+        checkpoint: seconds of training between checkpoints.
+    """
+
+    task: TaskConfig
+    method: dict[str, Any]
+    seed: int = 0
+    budget: str = "fast"
+    directory: str | None = None
+    threads: int | None = None
+    checkpoint: float = 30.0
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The part that decides what a run gives; the rest says where and with what."""
+        elsewhere = ("directory", "threads", "checkpoint")
+        return {name: value for name, value in asdict(self).items() if name not in elsewhere}
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.method.get("name"), str):
+            raise TsbenchError("method.name is missing")
+        if not 0 <= self.seed < SEEDS:
+            raise TsbenchError(f"seed must lie between 0 and {SEEDS - 1}, not {self.seed}")
+        if self.threads is not None and self.threads < 1:
+            raise TsbenchError(f"threads must be at least 1, not {self.threads}")
+        if not self.checkpoint >= 0.0:
+            raise TsbenchError(f"checkpoint must not be negative, not {self.checkpoint}")
+        if self.budget not in self.task.budgets:
+            raise unknown("budget", self.budget, self.task.budgets)
+        for name, amount in vars(self.task.budgets[self.budget]).items():
+            if amount is not None and amount < 1:
+                key = f"task.budgets.{self.budget}.{name}"
+                raise TsbenchError(f"{key} must be at least 1, not {amount}")
+
+
+class PluginConfigurations(SearchPathPlugin):
+    """Shows Hydra the configurations of plug-ins. tsbench's own come first: none replaces them."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in list(plugins.configurations())[1:]:
+            search_path.append("plug-in", f"file://{folder}")
+
+
+@contextmanager
+def found_by_hydra() -> Iterator[None]:
+    """Within it, Hydra finds the configurations of tsbench and of plug-ins."""
+    Plugins.instance().register(PluginConfigurations)
+    with initialize_config_module(CONFIGURATIONS, version_base=VERSION_BASE):
+        yield
+
+
+def compose(words: Sequence[str]) -> RunConfig:
+    """The configuration that `key=value` words select.
+
+    Raises:
+        TsbenchError: the words do not make a valid configuration.
+    """
+    overrides = parse_words(words)
+    if "task" not in {override.key_or_group for override in overrides}:
+        raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(names('task'))}")
+    for override in overrides:
+        if override.is_sweep_override():
+            raise TsbenchError(f"{override.input_line} asks for several runs: add -m for a sweep")
+    try:
+        with one_line_errors(), found_by_hydra():
+            node = hydra_compose("config", overrides=opened(words))
+    except ValueError as error:  # Hydra's answer to a group's value that is no name
+        raise TsbenchError(f"{_flat(error)} (in: {' '.join(words)})") from None
+    return parse(node)
+
+
+def parse(node: DictConfig) -> RunConfig:
+    """Gives a composed configuration its types.
+
+    Raises:
+        TsbenchError: a key is missing or unknown, or a value is of the wrong type or range.
+    """
+    with one_line_errors():
+        plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+    config: RunConfig = typed(RunConfig, plain, "")
+    return config
+
+
+def sweep(words: Sequence[str]) -> Iterator[list[str]]:
+    """The jobs that a sweep (`-m`) over discrete values consists of, as words.
+
+    Raises:
+        TsbenchError: the words cannot be read.
+    """
+    choices: list[list[str]] = []
+    for override in parse_words(words):
+        if not override.is_sweep_override():
+            choices.append([str(override.input_line)])
+        elif override.is_discrete_sweep():
+            key = override.get_key_element()
+            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        # What remains is an interval, which the sweeper draws from: each job checks its own value.
+    return (list(job) for job in itertools.product(*choices))
+
+
+def opened(words: Sequence[str]) -> list[str]:
+    """The words with `++` (add or change) before keys of mappings that YAML lists only in part."""
+    return [f"++{word}" if word.startswith(OPEN_MAPPINGS) else word for word in words]
+
+
+def parse_words(words: Sequence[str]) -> list[Override]:
+    """The words in Hydra's grammar.
+
+    Raises:
+        TsbenchError: one of them cannot be read.
+    """
+    with one_line_errors():
+        overrides = list(OverridesParser.create().parse_overrides(list(words)))
+    for override in overrides:
+        group, _, rest = override.key_or_group.partition(".")
+        if group in ("task", "method") and rest == "name":
+            raise TsbenchError(f"{group}.name comes with {group}=NAME and cannot be changed alone")
+    return overrides
+
+
+def names(group: str) -> tuple[str, ...]:
+    """The configurations of a group ("task" or "method"), sorted."""
+    return tuple(sorted(_files(group)))
+
+
+def budgets(task: str) -> dict[str, Budget]:
+    """The budgets that a task's configuration offers; none without a configuration.
+
+    Raises:
+        TsbenchError: the configuration is wrong.
+    """
+    file = _files("task").get(task)
+    if file is None:
+        return {}
+    with one_line_errors():
+        plain = OmegaConf.to_container(OmegaConf.create(file.read_text("utf-8")), resolve=True)
+    config: TaskConfig = typed(TaskConfig, plain, "task")
+    return config.budgets
+
+
+def _files(group: str) -> dict[str, Traversable]:
+    """The files of a group by name; where two have one name, the one that Hydra takes."""
+    found: dict[str, Traversable] = {}
+    for folder in plugins.configurations(group):
+        for file in folder.iterdir():
+            if file.name.endswith(".yaml"):
+                found.setdefault(file.name.removesuffix(".yaml"), file)
+    return found
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Turns what Hydra and OmegaConf raise about the user's words into a TsbenchError."""
+    try:
+        yield
+    except OverrideParseException as error:
+        words = "expected key=value, the value quoted where it has special characters"
+        raise TsbenchError(f"cannot read '{error.override}': {words}") from None
+    except MissingConfigException as error:
+        if error.options is None or error.missing_cfg_file is None:
+            raise TsbenchError(_flat(error)) from None
+        missing = str(error.missing_cfg_file)
+        parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
+        raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
+    except CompactHydraException as error:
+        cause = error.__cause__
+        if isinstance(cause, OmegaConfBaseException) and isinstance(cause.parent_node, DictConfig):
+            path = str(cause.full_key or "").removesuffix(str(cause.key)).rstrip(".")
+            siblings = [str(name) for name in cause.parent_node if name != "hydra"]
+            raise unknown_key(path, str(cause.key), siblings) from None
+        raise TsbenchError(_flat(error)) from None
+    except (HydraException, OmegaConfBaseException) as error:
+        raise TsbenchError(_flat(error)) from None
+
+
+def _flat(error: Exception) -> str:
+    """A message of several lines as one, without the list of places that were searched."""
+    return " ".join(str(error).split("Config search path")[0].split())

@@ -1,0 +1,364 @@
+"""One training run: a configuration in, a directory that explains itself out."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import io
+import json
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, replace
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+
+from tsbench import methods, tasks
+from tsbench.core import plugins
+from tsbench.runs.config import RunConfig
+from tsbench.core.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
+from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.protocol import SMOKE, V1
+from tsbench.evaluation.score import Score
+from tsbench.core.files import PART, taken, write_json, write_whole
+from tsbench.core.method import Problem
+from tsbench.runs.progress import progress_bar
+from tsbench.runs.directory import Record, RunDirectory
+from tsbench.rl.stages import settings
+from tsbench.rl.threads import one_thread
+from tsbench.sim.model import compiled_hash
+from tsbench.core.typed import unknown_key
+from tsbench.runs.workspace import RunWorkspace
+
+PACKAGE = Path(str(files("tsbench")))
+# What can change a number in a run.
+PACKAGES = (
+    "dm-control",
+    "gymnasium",
+    "hydra-core",
+    "mink",
+    "mujoco",
+    "numpy",
+    "rsl-rl-lib",
+    "scipy",
+    "torch",
+    "tsbench",
+)
+_NAMES = {  # of what has to stay the same, in words
+    "configuration": "configuration",
+    "python": "version of Python",
+    "packages": "version of a package",
+    "code": "version of tsbench's own code",
+    "plug-ins": "version of a plug-in",
+    "physics": "model of the task",
+}
+
+
+def prepare(config: RunConfig) -> Problem:
+    """What the configuration asks for, with all of it checked and nothing written.
+
+    Raises:
+        TsbenchError: unknown names, or values of the wrong type.
+    """
+    problem = Problem(
+        task=tasks.make(config.task.name, **config.task.constants),
+        budget=config.task.budgets[config.budget],
+        training=config.task.training,
+        options=config.method,
+        seed=config.seed,
+        threads=config.threads,
+    )
+    name = config.method["name"]
+    methods.options(methods.find(name).Options, problem)
+    known = methods.all_stages()
+    for kind in dict.fromkeys([*methods.stages(name), *config.task.training]):
+        if kind not in known:
+            raise unknown_key("task.training", kind, known)
+        settings(problem, kind)
+    return problem
+
+
+def execute(config: RunConfig, words: Sequence[str] = (), console: Console | None = None) -> Score:
+    """Trains, evaluates, and leaves it all in `config.directory`, but for the pages about it.
+
+    Args:
+        config: what to run, with its directory.
+        words: of the command line, for the record.
+        console: where progress and results are shown.
+
+    Raises:
+        TsbenchError: the configuration is wrong, the directory exists or cannot be written, or
+            the method cannot do the task. A run that fails before it has trained leaves nothing.
+        Stopped: by Ctrl-C or SIGTERM.
+    """
+    problem = prepare(config)
+    run = RunDirectory(Path(config.directory or ""))
+    with os_errors(run.path):
+        found = set(run.path.iterdir()) if run.path.is_dir() else None
+        _create(run)
+    with _locked(run.path), _explained(run):
+        try:
+            _write_provenance(run, config, problem, words)
+            line = f"{' '.join(['tsbench run', *words])} -> {run.path}"
+            return _work(config, problem, run, line, console or Console())
+        except (TsbenchError, OSError) as error:
+            if not run.trained and not isinstance(error, NotFiniteError):
+                _leave_as_found(run.path, found)
+            raise
+
+
+def resume(directory: Path, console: Console | None = None) -> Score:
+    """Goes on with an interrupted run, and ends with the same bits as if it had not been.
+
+    Raises:
+        TsbenchError: there is no such run, it is finished or under way, or it was begun with
+            another configuration or other versions. Beyond that, as `execute`.
+        Stopped: by Ctrl-C or SIGTERM.
+    """
+    run = RunDirectory(directory)
+    if not run.begun:
+        raise TsbenchError(f"there is no run in {directory}")
+    with _locked(directory):
+        if run.finished:
+            raise TsbenchError(f"{directory} holds a finished run: there is nothing to resume")
+        config = replace(run.config(), directory=str(directory))
+        problem = prepare(config)
+        _check_provenance(run, config, problem)
+        with _explained(run):
+            for path in directory.rglob(f"*{PART}"):
+                path.unlink(missing_ok=True)
+            line = f"tsbench run resume={directory}"
+            return _work(config, problem, run, line, console or Console())
+
+
+def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
+    """Does what is missing of a run of a sweep: all of it, the rest of it, or nothing.
+
+    Returns:
+        Its normalized reward.
+
+    Raises:
+        TsbenchError: as `execute` and `resume`; or the directory holds another run.
+        Stopped: by Ctrl-C or SIGTERM.
+    """
+    run = RunDirectory(Path(config.directory or ""))
+    if not run.begun:
+        return execute(config, words).normalized_reward
+    if run.config().identity != config.identity:
+        raise taken(run.path, "a run with another configuration")
+    if run.finished:
+        Console().print(f"finished already: {run.path}", highlight=False, soft_wrap=True)
+        return run.record().score.normalized_reward
+    return resume(run.path).normalized_reward
+
+
+def _work(
+    config: RunConfig, problem: Problem, run: RunDirectory, line: str, console: Console
+) -> Score:
+    identity = json.dumps(_identity(config, problem), sort_keys=True)
+    workspace = RunWorkspace(
+        run.path,
+        console,
+        interval=config.checkpoint,
+        run=hashlib.sha256(identity.encode()).hexdigest(),
+    )
+    with closing(workspace), signals(workspace.stop), memory_errors(), one_thread():
+        workspace.note(line)
+        record = _train(config, problem, workspace, console)
+        write_json(run.score_file, record.as_dict())  # last: it says that the run is finished
+    shutil.rmtree(run.checkpoints, ignore_errors=True)
+    return record.score
+
+
+@contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """Keeps others out of the directory. The system lifts the lock whenever the process ends."""
+    with os_errors(directory):
+        descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise TsbenchError(f"another process is at work in {directory}") from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def signals(stop: Callable[[int], None]) -> Iterator[None]:
+    """Lets Ctrl-C and SIGTERM call `stop` with their number, where this thread may do that."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {
+        number: signal.signal(number, lambda number, _: stop(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _explained(run: RunDirectory) -> Iterator[None]:
+    """Turns what stops a run into one line, which says how to go on where one can."""
+    try:
+        with os_errors(run.path):
+            yield
+    except NotFiniteError as error:
+        raise TsbenchError(f"{error}{_dumped(run.dump_file, error)}") from error
+    except TsbenchError as error:
+        raise TsbenchError(f"{error}{_way_on(run)}") from error
+    except Stopped as stopped:
+        raise Stopped(stopped.signal, f"{stopped}{_way_on(run)}") from None
+
+
+def _dumped(path: Path, error: NotFiniteError) -> str:
+    """Keeps what the wrong number was computed from."""
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **error.arrays)
+    with os_errors(path):
+        write_whole(path, content.getvalue())
+    return f"; what it came from is in {path}"
+
+
+def _way_on(run: RunDirectory) -> str:
+    return f"; to go on: tsbench run resume={run.path}" if run.trained else ""
+
+
+def _train(
+    config: RunConfig, problem: Problem, workspace: RunWorkspace, console: Console
+) -> Record:
+    run = RunDirectory(workspace.directory)
+    policy = methods.find(config.method["name"]).train(problem, workspace)
+    policy.save(run.path)
+    protocol = SMOKE if config.budget == SMOKE.name else V1
+    with progress_bar(console, "evaluate") as progress:
+        score = evaluate(
+            policy, problem.task, protocol=protocol, threads=problem.threads, progress=progress
+        )
+    assert score.log is not None
+    score.log.save(run.actions_file)
+    return Record(
+        task=problem.task.name,
+        task_version=problem.task.version,
+        standard=tasks.standard(problem.task),
+        method=config.method["name"],
+        seed=config.seed,
+        budget=config.budget,
+        score=score,
+        stages=tuple(replace(stage, seconds=round(stage.seconds, 3)) for stage in workspace.stages),
+    )
+
+
+def _create(run: RunDirectory) -> None:
+    """Makes the directory. One that is empty, or that a run left before it began, will do."""
+    run.path.mkdir(parents=True, exist_ok=True)
+    left = {path.name.removesuffix(PART) for path in run.path.iterdir()}
+    if left <= {run.versions_file.name, run.config_file.name} and not run.config_file.exists():
+        return
+    elsewhere = "choose another directory=PATH"
+    if run.finished:
+        raise taken(run.path, "a finished run", elsewhere)
+    if run.config_file.exists():
+        way_out = f"go on with resume={run.path}, or {elsewhere}"
+        raise taken(run.path, "an unfinished run", way_out)
+    raise taken(run.path, "other files", elsewhere)
+
+
+def _leave_as_found(directory: Path, found: set[Path] | None) -> None:
+    """Removes what a run has written; `found` is what was there before, None for no directory."""
+    if found is None:
+        shutil.rmtree(directory, ignore_errors=True)
+        return
+    for path in set(directory.iterdir()) - found:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _write_provenance(
+    run: RunDirectory, config: RunConfig, problem: Problem, words: Sequence[str]
+) -> None:
+    """Writes what is needed to repeat the run: versions.json, and config.yaml, which comes last:
+    its presence says that the run has begun."""
+    versions = {
+        **_identity(config, problem),
+        "platform": platform.platform(),
+        "commit": _commit(),
+    }
+    run.versions_file.unlink(missing_ok=True)
+    write_json(run.versions_file, versions)
+    command = " ".join(["tsbench run", *words])
+    content = yaml.safe_dump(asdict(config), sort_keys=False)
+    write_whole(run.config_file, f"# {command}\n{content}".encode())
+
+
+def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
+    """All that decides what a run gives, to the last bit, on one kind of machine."""
+    code = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        code.update(path.read_bytes())
+    configuration = json.dumps(config.identity, sort_keys=True)
+    brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
+    foreign = sorted(one for one in brought if one not in (None, plugins.own()))
+    return {
+        "configuration": hashlib.sha256(configuration.encode()).hexdigest(),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "code": code.hexdigest(),
+        "plug-ins": {
+            provider.distribution: {"version": provider.version, "code": provider.code()}
+            for provider in foreign
+        },
+        "physics": {problem.task.name: compiled_hash(problem.task.spec())},
+    }
+
+
+def _check_provenance(run: RunDirectory, config: RunConfig, problem: Problem) -> None:
+    """
+    Raises:
+        TsbenchError: a run begun as `versions.json` says would not go on to the same bits now.
+    """
+    before = run.versions()
+    for name, now in _identity(config, problem).items():
+        if before.get(name) != now:
+            raise TsbenchError(
+                f"{run.path} was begun with another {_NAMES[name]} (see {run.versions_file}), "
+                "so an exact resume is impossible: begin it again elsewhere"
+            )
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that tsbench lies in, with "+" when it has been changed."""
+    root = PACKAGE.parent
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        return None
+    git = ["git", "-C", str(root)]
+    commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True)
+    changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True)
+    if commit.returncode:
+        return None
+    return commit.stdout.strip() + ("+" if changes.stdout else "")

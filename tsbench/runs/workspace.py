@@ -1,0 +1,320 @@
+"""What a method reports while it trains: progress for the eye, and records in plain files."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+from tsbench.runs.checkpoint import Checkpoint, Checkpoints
+from tsbench.core.errors import Stopped, TsbenchError
+from tsbench.runs.events import Events
+from tsbench.core.method import Monitor, Snapshot
+from tsbench.runs.directory import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
+from tsbench.core.typed import typed
+from tsbench.core.words import duration, number
+
+INTERVAL = 30.0  # seconds of training between checkpoints
+PLAIN_INTERVAL = 60.0  # seconds between lines where there is no terminal to draw a bar on
+PLAIN_SHARE = 0.1  # or this share of the stage, whichever is first
+
+
+@dataclass(frozen=True)
+class Saved:
+    """The content of a checkpoint.
+
+    Attributes:
+        run: which run it belongs to.
+        stages: the finished ones and the one under way.
+        sizes: bytes of the files that were written until then and are not written anew.
+        learner: what the stage under way goes on from.
+    """
+
+    run: str
+    stages: list[Stage]
+    sizes: dict[str, int]
+    learner: dict[str, Any]
+
+
+@dataclass
+class RunMonitor:
+    """Takes a stage's figures, once for each iteration of its learner. A `problem.Monitor`."""
+
+    workspace: RunWorkspace
+    stage: Stage
+    display: _Display
+    saved: Snapshot | None
+    began: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.began = time.perf_counter() - self.stage.seconds
+
+    @property
+    def physics_substeps(self) -> int:
+        return self.stage.physics_substeps
+
+    @physics_substeps.setter
+    def physics_substeps(self, count: int) -> None:
+        self.stage.physics_substeps = count
+
+    @property
+    def warnings(self) -> dict[str, int]:
+        return self.stage.warnings
+
+    @warnings.setter
+    def warnings(self, counts: dict[str, int]) -> None:
+        self.stage.warnings = counts
+
+    def update(
+        self,
+        steps: int,
+        metrics: Mapping[str, float],
+        snapshot: Callable[[], Snapshot] | None = None,
+    ) -> None:
+        """Records an iteration and, when it is time, saves what to go on from.
+
+        Args:
+            steps: environment steps of this stage so far.
+            metrics: named scalars, such as episode_return; those that are not finite are dropped.
+            snapshot: gives all that the next iteration depends on.
+
+        Raises:
+            Stopped: a signal has arrived.
+        """
+        self.stage.steps = steps
+        self.stage.seconds = time.perf_counter() - self.began
+        finite = {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
+        self.workspace.record(self.stage, finite)
+        self.display.show(self.stage, finite.get("episode_return"))
+        if snapshot is not None:
+            self.workspace.keep(self.stage, snapshot)
+
+
+@dataclass
+class Finished:
+    """The monitor of a stage that was finished before the run was interrupted: all is known."""
+
+    saved: Snapshot | None
+    physics_substeps: int = 0
+    warnings: dict[str, int] = field(default_factory=dict)
+
+    def update(
+        self,
+        steps: int,
+        metrics: Mapping[str, float],
+        snapshot: Callable[[], Snapshot] | None = None,
+    ) -> None:
+        """Nothing is left to record."""
+
+
+class RunWorkspace:
+    """A run directory in use: `metrics.jsonl`, TensorBoard events, `log.txt` and checkpoints.
+
+    A `problem.Workspace`. Everything is written at once, line by line. In a directory that an
+    interrupted run left, the metrics go back to the newest checkpoint, and the events with them:
+    what came after it is done again.
+    """
+
+    def __init__(
+        self, directory: Path, console: Console, *, interval: float = INTERVAL, run: str = ""
+    ) -> None:
+        """
+        Args:
+            directory: of the run.
+            console: where progress is shown.
+            interval: seconds of training between checkpoints.
+            run: tells this run from others: their checkpoints are refused.
+
+        Raises:
+            TsbenchError: the checkpoints are another run's, or the metrics have been cut since or
+                are damaged.
+        """
+        self.directory = directory
+        self.stages: list[Stage] = []
+        self._console = console
+        self._interval = interval
+        self._run = run
+        self._began = time.perf_counter()
+        self._stopped_by: int | None = None  # a signal that has arrived
+        self._learning = False  # whether there is an iteration to finish and a state to save
+        with ExitStack() as files:
+            self._log = files.enter_context((directory / LOG).open("a", encoding="utf-8"))
+            self._checkpoints = Checkpoints(directory / CHECKPOINTS, self.note)
+            self._number, self._saved = self._newest()
+            self._metrics = files.enter_context((directory / METRICS).open("ab"))
+            self._rewind()
+            self._events = Events(directory / EVENTS, directory / METRICS, self.note)
+            files.callback(self._events.close)
+            self._files = files.pop_all()
+
+    def _newest(self) -> tuple[int, Saved | None]:
+        """The stage to go on with, and where; -1 and nothing if the run has to begin anew."""
+        checkpoint = self._checkpoints.newest()
+        if checkpoint is None:
+            return -1, None
+        saved = _read(checkpoint)
+        if saved.run != self._run:
+            raise TsbenchError(f"{checkpoint.path} is a checkpoint of another run")
+        return checkpoint.stage, saved
+
+    def _rewind(self) -> None:
+        """Drops from the metrics what will be done again."""
+        path, size = self.directory / METRICS, self._saved.sizes[METRICS] if self._saved else 0
+        if self._metrics.tell() < size:
+            raise TsbenchError(f"{path} has been cut since the last checkpoint")
+        lost = path.read_bytes()[size:].count(b"\n")
+        self._metrics.truncate(size)
+        self._metrics.seek(0, os.SEEK_END)
+        if self._saved:
+            stage = self._saved.stages[-1]
+            self.note(f"resumed: {stage.name} goes on at {stage.steps:,} steps")
+        if lost:
+            self.note(f"{lost} iterations after the last checkpoint are done again")
+
+    def close(self) -> None:
+        self._files.close()
+
+    def note(self, line: str) -> None:
+        """Tells the user something in plain words, and keeps it in the log."""
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._log.write(f"{time.perf_counter() - self._began:10.1f} s  {line}\n")
+        self._log.flush()
+
+    def stop(self, signal: int) -> None:
+        """Stops the run: when the iteration under way is done and saved; where there is none, or
+        when asked again, at once.
+
+        Raises:
+            Stopped: at once.
+        """
+        if self._stopped_by is not None or not self._learning:
+            raise Stopped(signal)
+        self._stopped_by = signal
+
+    @contextmanager
+    def stage(self, name: str, steps: int) -> Iterator[Monitor]:
+        """A stage of the method, with its progress bar.
+
+        Args:
+            name: e.g. "plan", "imitate".
+            steps: environment steps that it may use.
+        """
+        number, learner = len(self.stages), None
+        stage = Stage(name, steps)
+        if self._saved and number <= self._number:
+            stage = self._saved.stages[number]
+            checkpoint = self._checkpoints.newest(number)
+            learner = _read(checkpoint).learner if checkpoint else None
+        self.stages.append(stage)
+        if stage.steps >= stage.budget:  # it was finished when the run was interrupted
+            yield Finished(learner)
+            return
+        stage.interruptions += learner is not None
+        self._saved_at = time.perf_counter()
+        with _Display(self._console, stage) as display:
+            monitor = RunMonitor(self, stage, display, learner)
+            yield monitor
+            stage.seconds = time.perf_counter() - monitor.began
+        self._learning = False
+        self.note(f"{name}: {stage.steps:,} steps in {duration(stage.seconds)}{display.figures}")
+        for kind, count in stage.warnings.items():
+            self.note(f"{name}: mujoco warned {count:,} times of {kind}")
+
+    def record(self, stage: Stage, metrics: Mapping[str, float]) -> None:
+        """Appends an iteration's figures to `metrics.jsonl` and to the TensorBoard events."""
+        row = {"stage": stage.name, "steps": stage.steps, "seconds": round(stage.seconds, 3)}
+        row |= metrics
+        self._metrics.write((json.dumps(row) + "\n").encode())
+        self._metrics.flush()
+        self._events.add(row)
+
+    def keep(self, stage: Stage, snapshot: Callable[[], Snapshot]) -> None:
+        """Saves a checkpoint if it is time: now and then, at the stage's end, before a stop.
+
+        Raises:
+            Stopped: a signal has arrived.
+        """
+        self._learning = True
+        due = time.perf_counter() - self._saved_at >= self._interval
+        if due or stage.steps >= stage.budget or self._stopped_by is not None:
+            os.fsync(self._metrics.fileno())
+            saved = Saved(
+                run=self._run,
+                stages=self.stages,
+                sizes={METRICS: self._metrics.tell()},
+                learner=dict(snapshot()),
+            )
+            number = len(self.stages) - 1
+            self._checkpoints.save(number, stage.name, stage.steps, asdict(saved))
+            self._saved_at = time.perf_counter()
+        if self._stopped_by is not None:
+            raise Stopped(self._stopped_by)
+
+
+def _read(checkpoint: Checkpoint) -> Saved:
+    try:
+        saved: Saved = typed(Saved, checkpoint.content, "")
+        if len(saved.stages) != checkpoint.stage + 1 or saved.sizes.keys() != {METRICS}:
+            raise TsbenchError("it lacks stages or records")
+    except TsbenchError as error:
+        raise TsbenchError(f"damaged checkpoint {checkpoint.path}: {error}") from None
+    return saved
+
+
+class _Display:
+    """A progress bar on a terminal, elsewhere a line now and then."""
+
+    def __init__(self, console: Console, stage: Stage) -> None:
+        self._console = console
+        self._bar: Progress | None = None
+        self.figures = ""  # in words, as last shown
+        self._shown_at = time.perf_counter()
+        self._shown_steps = 0
+        if console.is_terminal:
+            columns = (
+                TextColumn("{task.description:<10}"),
+                BarColumn(),
+                TaskProgressColumn(),
+                TextColumn("{task.fields[figures]}"),
+            )
+            self._bar = Progress(*columns, console=console, transient=True)
+            self._row = self._bar.add_task(stage.name, total=stage.budget, figures="")
+
+    def __enter__(self) -> _Display:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def show(self, stage: Stage, reward: float | None) -> None:
+        """Draws the stage's progress; `reward` is the learner's mean return, where known."""
+        rate = stage.steps / max(stage.seconds, 1e-9)
+        left = max(stage.budget - stage.steps, 0) / max(rate, 1e-9)
+        self.figures = f", reward {number(reward)}, {rate:,.0f} steps/s"
+        line = f"{self.figures[2:]}, {duration(left)} left"
+        if self._bar:
+            self._bar.update(self._row, completed=stage.steps, figures=line)
+            return
+        now = time.perf_counter()
+        far = stage.steps - self._shown_steps >= PLAIN_SHARE * stage.budget
+        if far or now - self._shown_at >= PLAIN_INTERVAL:
+            self._shown_at, self._shown_steps = now, stage.steps
+            share = min(stage.steps / stage.budget, 1.0)
+            self._console.print(
+                f"{stage.name:<10} {share:4.0%}  {line}",
+                markup=False,
+                highlight=False,
+                soft_wrap=True,
+            )
