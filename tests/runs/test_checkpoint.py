@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from tsbench.runs.checkpoint import Checkpoints, decode, encode
 from tsbench.core.files import PART, write_whole
+from tsbench.runs.checkpoint import Checkpoints, decode, encode
 
 DTYPES = ("float32", "float64", "int64", "uint8", "bool")
 SHAPES = arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3)

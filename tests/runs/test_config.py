@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import pytest
 
 from tsbench import methods, tasks
-from tsbench.runs import config
 from tsbench.core.errors import TsbenchError
 from tsbench.core.typed import typed
+from tsbench.runs import config
 
 TASK = "task=rocket_navigation"
 

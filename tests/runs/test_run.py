@@ -23,19 +23,19 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 
 from tsbench import tasks
-from tsbench.cli import verbs as cli
-from tsbench.runs import config
 from tsbench.cli import launch
-from tsbench.runs import directory as record
-from tsbench.runs import execute as run
+from tsbench.cli import verbs as cli
 from tsbench.core import words
 from tsbench.core.errors import TsbenchError
-from tsbench.evaluation.protocol import PROTOCOLS, SMOKE
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.core.policy import Policy
+from tsbench.evaluation.protocol import PROTOCOLS, SMOKE
+from tsbench.runs import config
+from tsbench.runs import directory as record
+from tsbench.runs import execute as run
 from tsbench.runs.directory import RunDirectory, Stage
-from tsbench.sim.model import compiled_hash, fingerprint
 from tsbench.runs.workspace import RunWorkspace
+from tsbench.sim.model import compiled_hash, fingerprint
 
 WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512", "seed=3"]
 

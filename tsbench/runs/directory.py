@@ -11,15 +11,15 @@ from typing import Any, TypeVar
 import yaml
 
 from tsbench import tasks
-from tsbench.runs.config import RunConfig
 from tsbench.core.errors import TsbenchError, os_errors
-from tsbench.evaluation.protocol import PROTOCOLS, Protocol
-from tsbench.evaluation.score import Score
 from tsbench.core.files import check_new, write_json
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
+from tsbench.evaluation.protocol import PROTOCOLS, Protocol
+from tsbench.evaluation.score import Score
+from tsbench.runs.config import RunConfig
 
 M = TypeVar("M", Plan, ReferenceMotion)
 

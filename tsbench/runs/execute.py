@@ -26,20 +26,20 @@ from rich.console import Console
 
 from tsbench import methods, tasks
 from tsbench.core import plugins
-from tsbench.runs.config import RunConfig
 from tsbench.core.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
+from tsbench.core.files import PART, taken, write_json, write_whole
+from tsbench.core.method import Problem
+from tsbench.core.typed import unknown_key
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
-from tsbench.core.files import PART, taken, write_json, write_whole
-from tsbench.core.method import Problem
-from tsbench.runs.progress import progress_bar
-from tsbench.runs.directory import Record, RunDirectory
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
-from tsbench.sim.model import compiled_hash
-from tsbench.core.typed import unknown_key
+from tsbench.runs.config import RunConfig
+from tsbench.runs.directory import Record, RunDirectory
+from tsbench.runs.progress import progress_bar
 from tsbench.runs.workspace import RunWorkspace
+from tsbench.sim.model import compiled_hash
 
 PACKAGE = Path(str(files("tsbench")))
 # What can change a number in a run.

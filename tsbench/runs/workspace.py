@@ -15,13 +15,13 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-from tsbench.runs.checkpoint import Checkpoint, Checkpoints
 from tsbench.core.errors import Stopped, TsbenchError
-from tsbench.runs.events import Events
 from tsbench.core.method import Monitor, Snapshot
-from tsbench.runs.directory import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
 from tsbench.core.typed import typed
 from tsbench.core.words import duration, number
+from tsbench.runs.checkpoint import Checkpoint, Checkpoints
+from tsbench.runs.directory import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
+from tsbench.runs.events import Events
 
 INTERVAL = 30.0  # seconds of training between checkpoints
 PLAIN_INTERVAL = 60.0  # seconds between lines where there is no terminal to draw a bar on
