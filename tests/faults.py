@@ -3,7 +3,7 @@
     make faults            50 kills, and every other fault once
     make faults N=3        what CI does
 
-Runs are started by `cli.main` in forked processes, which spares each of them some seconds of
+Runs are started by `verbs.main` in forked processes, which spares each of them some seconds of
 imports, and killed by signals from outside: in an iteration drawn at random or after the last one,
 and there after a random amount of processor time, which a busy machine does not change. After the
 kills a run is resumed until it ends, and what it leaves is compared with a run that was left alone:
@@ -37,7 +37,7 @@ import pytest
 import torch
 
 import tsbench.cli.launch  # noqa: F401  what a run imports, before the forks
-from tsbench.cli import verbs as cli
+from tsbench.cli import verbs
 from tsbench.rl.ppo import Learner
 from tsbench.rl.rollout import Rollout
 from tsbench.sim.model import load_spec
@@ -98,7 +98,7 @@ class Process:
                 sys.argv = ["tsbench"]
                 if before is not None:
                     before()
-                status = cli.main(words)
+                status = verbs.main(words)
                 sys.stdout.flush()
                 sys.stderr.flush()
             except BaseException:

@@ -21,8 +21,7 @@ from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.core.policy import Policy, PolicyInfo
 from tsbench.evaluation import words
 from tsbench.evaluation.evaluate import check_fit
-from tsbench.runs import config
-from tsbench.runs import execute as run
+from tsbench.runs import config, execute
 from tsbench.runs.checkpoint import Checkpoints
 from tsbench.runs.directory import Record, RunDirectory
 
@@ -67,7 +66,7 @@ def right_or_refused(call: Callable[[], Any]) -> None:
 @settings(max_examples=50)
 @given(WORDS)
 def test_words(words: list[str]) -> None:
-    right_or_refused(lambda: run.prepare(config.compose([f"task={NAME}", *words])))
+    right_or_refused(lambda: execute.prepare(config.compose([f"task={NAME}", *words])))
 
 
 @pytest.fixture(scope="session")
@@ -117,7 +116,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "reference.npz": lambda folder: ReferenceMotion.load(folder / "reference.npz"),
     "policy.safetensors": read_policy,
     "policy.json": read_policy,
-    "config.yaml": lambda folder: run.prepare(RunDirectory(folder).config()),
+    "config.yaml": lambda folder: execute.prepare(RunDirectory(folder).config()),
     "score.json": read_score,
 }
 

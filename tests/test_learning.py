@@ -14,8 +14,7 @@ from rich.console import Console
 from tsbench import tasks
 from tsbench.rl.ppo import Learner
 from tsbench.rl.settings import PPOSettings
-from tsbench.runs import config
-from tsbench.runs import execute as run
+from tsbench.runs import config, execute
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.kinematic import Planning
 
@@ -42,7 +41,7 @@ def test_most_trainings_fly_the_rocket_to_its_goal(tmp_path: Path) -> None:
     for seed in range(3):
         words = [*WORDS, f"seed={seed}"]
         chosen = replace(config.compose(words), directory=str(tmp_path / str(seed)))
-        score = run.execute(chosen, words, Console(quiet=True))
+        score = execute.execute(chosen, words, Console(quiet=True))
         near.append(score.perturbed.goal_distance <= 0.3 * DISTANCE)
     assert sum(near) >= 2
 

@@ -138,21 +138,20 @@ def evaluate(
 
     from tsbench import tasks
     from tsbench.core.policy import Policy
-    from tsbench.evaluation import foreign as adapters
+    from tsbench.evaluation import foreign, references
     from tsbench.evaluation import protocol as protocols
-    from tsbench.evaluation import references
     from tsbench.evaluation.evaluate import evaluate as score
 
     made = tasks.make(task)
     if protocol not in protocols.PROTOCOLS:
         raise unknown("protocol", protocol, protocols.PROTOCOLS)
     if isinstance(policy, (str, Path)):
-        policy = references.named(Path(policy), made) or adapters.load(Path(policy), made)
-    if not isinstance(policy, (Policy, adapters.ForeignPolicy)):
+        policy = references.named(Path(policy), made) or foreign.load(Path(policy), made)
+    if not isinstance(policy, (Policy, foreign.ForeignPolicy)):
         if callable(policy):
-            policy = adapters.from_function(policy, made)
+            policy = foreign.from_function(policy, made)
         elif hasattr(policy, "predict"):
-            policy = adapters.from_sb3_model(policy, made)
+            policy = foreign.from_sb3_model(policy, made)
         else:
             kind = type(policy).__name__
             raise TsbenchError(f"a policy must be a model, a file or a function, not {kind}")

@@ -15,9 +15,9 @@ from stable_baselines3 import PPO
 
 import tsbench
 from tsbench import TsbenchError, tasks
-from tsbench.cli import verbs as cli
+from tsbench.cli import verbs
 from tsbench.core.policy import Policy
-from tsbench.evaluation import foreign as adapters
+from tsbench.evaluation import foreign
 
 TASK = tasks.make("rocket_navigation")
 RNG = np.random.default_rng(0)
@@ -81,7 +81,7 @@ def test_a_function() -> None:
         seen.append(observation.shape)
         return [float(observation[0]), 0.5]
 
-    policy = adapters.from_function(act, TASK)
+    policy = foreign.from_function(act, TASK)
     actions = policy(OBSERVATIONS)
     assert seen == [(10,)] * 7
     np.testing.assert_array_equal(actions[:, 0], OBSERVATIONS[:, 0])
@@ -121,7 +121,7 @@ def test_evaluate_takes_a_function() -> None:
 
 def test_evaluate_takes_a_model_that_is_there(baseline: tuple[Path, PPO]) -> None:
     score = tsbench.evaluate(baseline[1], "rocket_navigation", protocol="smoke", threads=1)
-    loaded = adapters.from_sb3(baseline[0], "PPO", TASK)
+    loaded = foreign.from_sb3(baseline[0], "PPO", TASK)
     same = tsbench.evaluate(loaded, "rocket_navigation", protocol="smoke", threads=1)
     assert score.nominal == same.nominal
     with pytest.raises(TsbenchError, match="a model, a file or a function, not int"):
@@ -130,7 +130,7 @@ def test_evaluate_takes_a_model_that_is_there(baseline: tuple[Path, PPO]) -> Non
 
 @pytest.mark.parametrize("rows", [1, "n"])
 def test_onnx(rows: Any, tmp_path: Path) -> None:
-    policy = adapters.load(write_onnx(tmp_path / "p.onnx", rows=rows), TASK)
+    policy = foreign.load(write_onnx(tmp_path / "p.onnx", rows=rows), TASK)
     actions = policy(OBSERVATIONS)
     expected = np.tanh(OBSERVATIONS.astype(np.float32) @ WEIGHT)
     np.testing.assert_allclose(actions, expected, atol=1e-6)
@@ -142,29 +142,29 @@ def test_onnx(rows: Any, tmp_path: Path) -> None:
 
 def test_onnx_files_that_do_not_fit(tmp_path: Path) -> None:
     with pytest.raises(TsbenchError, match=r"not one input of floats \(n, 10\) for rocket_nav"):
-        adapters.load(write_onnx(tmp_path / "p.onnx", inputs=11), TASK)
+        foreign.load(write_onnx(tmp_path / "p.onnx", inputs=11), TASK)
     with pytest.raises(TsbenchError, match=r"takes tensor\(float\) \[4, 10\], not one input"):
-        adapters.load(write_onnx(tmp_path / "r.onnx", rows=4), TASK)
+        foreign.load(write_onnx(tmp_path / "r.onnx", rows=4), TASK)
     (tmp_path / "q.onnx").write_bytes(b"nonsense")
     with pytest.raises(TsbenchError, match="damaged ONNX file"):
-        adapters.load(tmp_path / "q.onnx", TASK)
+        foreign.load(tmp_path / "q.onnx", TASK)
     (tmp_path / "q.txt").write_bytes(b"nonsense")
     with pytest.raises(TsbenchError, match=r"neither a run directory nor an \.onnx or \.zip"):
-        adapters.load(tmp_path / "q.txt", TASK)
+        foreign.load(tmp_path / "q.txt", TASK)
 
 
 def test_onnx_files_whose_answers_do_not_fit(tmp_path: Path) -> None:
-    flat = adapters.load(write_onnx(tmp_path / "flat.onnx", shape=(2,)), TASK)
+    flat = foreign.load(write_onnx(tmp_path / "flat.onnx", shape=(2,)), TASK)
     with pytest.raises(TsbenchError, match=r"flat\.onnx returns shape \(2,\), not \(1, 2\)"):
         flat(OBSERVATIONS)
-    broken = adapters.load(write_onnx(tmp_path / "broken.onnx", shape=(1, 3)), TASK)
+    broken = foreign.load(write_onnx(tmp_path / "broken.onnx", shape=(1, 3)), TASK)
     with pytest.raises(TsbenchError, match=r"broken\.onnx cannot be run: "):
         broken(OBSERVATIONS)
 
 
 def test_stable_baselines3(baseline: tuple[Path, PPO]) -> None:
     path, model = baseline
-    policy = adapters.load(path, TASK, "PPO")
+    policy = foreign.load(path, TASK, "PPO")
     actions = policy(OBSERVATIONS)
     expected = model.predict(OBSERVATIONS.astype(np.float32), deterministic=True)[0]
     np.testing.assert_allclose(actions, expected, atol=1e-6)
@@ -173,17 +173,17 @@ def test_stable_baselines3(baseline: tuple[Path, PPO]) -> None:
 
 def test_stable_baselines3_files_are_not_loaded_unasked(baseline: tuple[Path, PPO]) -> None:
     with pytest.raises(TsbenchError, match="can run any code when it is loaded"):
-        adapters.load(baseline[0], TASK)
+        foreign.load(baseline[0], TASK)
     with pytest.raises(TsbenchError, match="unknown stable-baselines3 algorithm 'PPPO'"):
-        adapters.load(baseline[0], TASK, "PPPO")
+        foreign.load(baseline[0], TASK, "PPPO")
     with pytest.raises(TsbenchError, match=r"not \(43,\) to \(12,\) as laikago_walk does"):
-        adapters.load(baseline[0], tasks.make("laikago_walk"), "PPO")
+        foreign.load(baseline[0], tasks.make("laikago_walk"), "PPO")
 
 
 def test_a_damaged_stable_baselines3_file(tmp_path: Path) -> None:
     (tmp_path / "m.zip").write_bytes(b"nonsense")
     with pytest.raises(TsbenchError, match="damaged stable-baselines3 file"):
-        adapters.load(tmp_path / "m.zip", TASK, "PPO")
+        foreign.load(tmp_path / "m.zip", TASK, "PPO")
 
 
 @pytest.mark.parametrize(("name", "extra"), [("onnxruntime", "onnx"), ("stable_baselines3", "sb3")])
@@ -193,7 +193,7 @@ def test_a_missing_extra(
     monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "p.onnx").touch()
     with pytest.raises(TsbenchError, match=rf"{name} is missing: pip install 'tsbench\[{extra}\]'"):
-        adapters.load(tmp_path / "p.onnx", TASK, "PPO" if extra == "sb3" else None)
+        foreign.load(tmp_path / "p.onnx", TASK, "PPO" if extra == "sb3" else None)
 
 
 def test_the_command_line(
@@ -201,7 +201,7 @@ def test_the_command_line(
 ) -> None:
     path = str(write_onnx(tmp_path / "p.onnx"))
     words = ["evaluate", path, "task=rocket_navigation", "--protocol", "smoke"]
-    assert cli.main(words) == 0
+    assert verbs.main(words) == 0
     shown = capsys.readouterr().out
     assert "protocol smoke" in shown
     assert "not to be ranked: protocol smoke asks too little" in shown
@@ -215,5 +215,5 @@ def test_the_command_line(
         (["zero", "task=rocket_navigation", "--protocol", "v0"], "unknown protocol 'v0'"),
         (["zero", "task=rocket_navigation", "--threads", "0"], "--threads: must be a whole number"),
     ):
-        assert cli.main(["evaluate", *wrong]) == 2
+        assert verbs.main(["evaluate", *wrong]) == 2
         assert message in capsys.readouterr().err

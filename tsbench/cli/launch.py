@@ -28,8 +28,7 @@ from rich.console import Console
 from tsbench.cli import tables
 from tsbench.core.errors import Stopped, TsbenchError, memory_errors
 from tsbench.core.files import write_json
-from tsbench.runs import config
-from tsbench.runs import execute as run
+from tsbench.runs import config, execute
 from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory, shown
 from tsbench.viewer.report import write_pages
@@ -68,7 +67,7 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
         return
     else:
         chosen = placed(config.compose(flags.overrides), flags.overrides)
-        run.execute(chosen, _own(flags.overrides))
+        execute.execute(chosen, _own(flags.overrides))
         place = Path(chosen.directory or "")
         finish(place)
     write_json(json, shown(RunDirectory(place).record()))
@@ -86,7 +85,7 @@ def finish(directory: Path, console: Console | None = None) -> None:
     tables.show_run(console, record, finished.task(record.task))
     way_on = f"; the run is finished, its pages are not: tsbench report {directory}"
     try:
-        with run.signals(_stop), memory_errors():
+        with execute.signals(_stop), memory_errors():
             write_pages(finished)
     except TsbenchError as error:
         raise TsbenchError(f"{error}{way_on}") from error
@@ -125,7 +124,7 @@ def _resume(place: Path) -> Path:
     """Goes on with a run: with its training, or with the pages of a finished one."""
     found = RunDirectory(place)
     if not found.finished or found.report_file.exists():
-        run.resume(place)
+        execute.resume(place)
     finish(place)
     return place
 
@@ -139,7 +138,7 @@ def _sweep(words: Sequence[str]) -> None:
     places: set[str] = set()
     for job in islice(config.sweep(words), CHECKED_JOBS):
         chosen = config.compose(job)
-        run.prepare(chosen)
+        execute.prepare(chosen)
         if chosen.directory in places:
             raise TsbenchError(
                 f"directory={chosen.directory} would be the place of several of the sweep's "
@@ -178,7 +177,7 @@ class _Job:
         chosen = placed(config.parse(node), words)
         place = RunDirectory(Path(chosen.directory or ""))
         try:
-            reward = run.complete(chosen, words)
+            reward = execute.complete(chosen, words)
             finish(place.path)
             return reward
         except Exception as error:
@@ -194,7 +193,7 @@ class _Job:
 def _show(flags: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """What Hydra can tell about the words and itself."""
     if flags.cfg:
-        run.prepare(config.compose(flags.overrides))
+        execute.prepare(config.compose(flags.overrides))
     words = flags.overrides = config.opened(flags.overrides)
     with _hydra() as hydra:
         if flags.shell_completion:

@@ -271,12 +271,12 @@ def _evaluate(words: Sequence[str]) -> int:
     from tsbench.evaluation.flips import flips
     from tsbench.evaluation.protocol import PHYSICS, PROTOCOLS, V1
     from tsbench.evaluation.replay import compare
-    from tsbench.runs import directory as record
+    from tsbench.runs import directory
     from tsbench.runs.progress import progress_bar
 
     path = Path(options.policy)
     policy, task = _policy(path, options.task, options.trust_sb3)
-    run = record.RunDirectory(path)
+    run = directory.RunDirectory(path)
     kept = run.record() if run.finished else None
     name = options.protocol or (kept.score.protocol if kept else V1.name)
     if name not in PROTOCOLS:
@@ -284,7 +284,7 @@ def _evaluate(words: Sequence[str]) -> int:
     protocol = PROTOCOLS[name]
     log = run.actions() if kept else None
     if options.keep is not None:
-        record.check_keep(run, options.keep, protocol)
+        directory.check_keep(run, options.keep, protocol)
         if options.physics is not None:
             parser.error("--keep keeps certified scores: leave out --physics")
     if options.physics is not None and options.physics not in PHYSICS:
@@ -301,7 +301,7 @@ def _evaluate(words: Sequence[str]) -> int:
     if kept is not None:
         comparison = compare(kept.score, score, task, log)
         agrees = comparison.agrees
-        shown = record.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
+        shown = directory.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
         line = f" {run.score_file}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if options.physics is not None:
@@ -328,7 +328,7 @@ def _evaluate(words: Sequence[str]) -> int:
             console.print(" not kept: the score is not what it was", highlight=False)
         return 1
     if options.keep is not None:
-        record.keep(run, options.keep, score)
+        directory.keep(run, options.keep, score)
         console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
     return 0
 
@@ -340,8 +340,7 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
         TsbenchError: there is no such policy, or the word for the task is missing or wrong.
     """
     from tsbench import tasks
-    from tsbench.evaluation import foreign as adapters
-    from tsbench.evaluation import references
+    from tsbench.evaluation import foreign, references
     from tsbench.runs.directory import RunDirectory
 
     name = None
@@ -365,7 +364,7 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
             raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
         raise TsbenchError(f"no run directory {path}")
     task = tasks.make(name)
-    return references.named(path, task) or adapters.load(path, task, trust_sb3), task
+    return references.named(path, task) or foreign.load(path, task, trust_sb3), task
 
 
 def _threads(word: str) -> int:

@@ -24,8 +24,7 @@ from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.references import zero
-from tsbench.runs import config
-from tsbench.runs import execute as run
+from tsbench.runs import config, execute
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import fingerprint
 from tsbench.sim.tracking import Imitation
@@ -244,7 +243,7 @@ class TaskContract(Contract):
         assert chosen.task.constants == {}
         assert config.budgets(name) == chosen.task.budgets
         for budget in chosen.task.budgets:
-            run.prepare(config.compose([f"task={name}", f"budget={budget}"]))
+            execute.prepare(config.compose([f"task={name}", f"budget={budget}"]))
 
     def test_it_can_be_pushed(self, name: str) -> None:
         task = tasks.make(name)
