@@ -19,8 +19,8 @@ from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import POLICIES, stored
 from tsbench.evaluation.score import Score
 from tsbench.runs.directory import RunDirectory
-from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction
+from tsbench.sim.physics import Physics
 from tsbench.tasks.laikago import HIPS, C, Laikago, LaikagoState
 
 BOARDS = Path(__file__).parents[2] / "leaderboards"

@@ -11,7 +11,7 @@ import numpy as np
 from tsbench.core.arrays import Array, step_of
 from tsbench.core.state import Course, S
 from tsbench.core.task import MDP
-from tsbench.sim.batched import Dynamics, expect_finite
+from tsbench.sim.dynamics import Dynamics, expect_finite
 
 PolicyFunction = Callable[[np.ndarray], np.ndarray]  # observations (n, o) -> actions (n, a)
 
