@@ -101,8 +101,9 @@ def load_batched(
 
     `threads` None means all cores; `push` may be another one for each environment.
     """
-    from tsbench.sim.batched import BatchedEnvironment, Physics
+    from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.kinematic import Planning
+    from tsbench.sim.physics import Physics
 
     mdp = _variant(name, variant, reference, seed, perturbed, push, constants)
     if count < 1:

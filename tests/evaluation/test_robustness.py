@@ -26,9 +26,9 @@ from tsbench.evaluation.robustness import (
     survival,
     wilson,
 )
-from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
+from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push
 from tsbench.sim.single import environment
 from tsbench.testing.episodes import one_of_each_kind

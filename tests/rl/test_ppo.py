@@ -21,10 +21,11 @@ from tsbench.rl.ppo import Learner
 from tsbench.rl.settings import PPOSettings
 from tsbench.rl.stages import StageSettings, learn_planning, settings
 from tsbench.rl.vec_env import TorchEnvironment
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.disturbed import Disturbances
 from tsbench.sim.episodes import play
 from tsbench.sim.kinematic import Planning
+from tsbench.sim.physics import Physics
 from tsbench.sim.tracking import Imitation
 
 TINY = PPOSettings(environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,))

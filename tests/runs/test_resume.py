@@ -31,9 +31,10 @@ from tsbench.runs import config, execute
 from tsbench.runs.checkpoint import Checkpoints, decode, encode
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.workspace import RunMonitor, RunWorkspace
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
+from tsbench.sim.physics import Physics
 from tsbench.sim.tracking import Imitation
 
 # Three stages of 3, 2 and 2 iterations.

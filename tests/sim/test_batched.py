@@ -12,8 +12,9 @@ import tsbench
 from tsbench import tasks
 from tsbench.core.motion import ReferenceMotion
 from tsbench.core.state import Start
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.kinematic import Planning
+from tsbench.sim.physics import Physics
 from tsbench.sim.tracking import Imitation
 from tsbench.testing.episodes import compare, plannable_tasks, play_batched, same
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from tsbench import tasks
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
+from tsbench.sim.physics import Physics
 from tsbench.testing.episodes import one_of_each_kind, same
 
 NAMES = one_of_each_kind()

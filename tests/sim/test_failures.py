@@ -14,8 +14,9 @@ from tsbench import tasks
 from tsbench.core.errors import NotFiniteError, TsbenchError
 from tsbench.core.state import Start, State
 from tsbench.core.task import Task
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.episodes import play
+from tsbench.sim.physics import Physics
 from tsbench.sim.single import environment
 
 STILL = np.zeros((3, 12))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import tsbench
 from tsbench import TsbenchError, tasks
 from tsbench.core.state import Start, State
-from tsbench.sim.batched import Physics
+from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push
 from tsbench.tasks.laikago import LaikagoState
 from tsbench.tasks.rocket import RocketState

@@ -15,7 +15,7 @@ from tsbench.sim.quiet import Quiet
 BATCH = """
 import mujoco, numpy
 from tsbench import tasks
-from tsbench.sim.batched import Physics
+from tsbench.sim.physics import Physics
 assert mujoco.get_mju_user_warning() is None, "an import has replaced the handler"
 heard = []
 if {own}:

@@ -11,7 +11,7 @@ import pytest
 
 from tsbench import TsbenchError, tasks
 from tsbench.core.motion import ReferenceMotion
-from tsbench.sim.batched import Physics
+from tsbench.sim.physics import Physics
 from tsbench.sim.tracking import Imitation, deepmimic_reward
 from tsbench.testing.episodes import plannable_tasks
 

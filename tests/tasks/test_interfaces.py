@@ -24,8 +24,9 @@ from tsbench.core.task import Abstraction, Plannable, Task, Tracker
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.methods.twostage import extract
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.kinematic import Planning, naive_plan
+from tsbench.sim.physics import Physics
 from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
 from tsbench.viewer.recording import record_episode

@@ -17,8 +17,8 @@ from tsbench import TsbenchError, tasks
 from tsbench.core import rotations
 from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.core.state import Start
-from tsbench.sim.batched import Physics
 from tsbench.sim.model import compiled
+from tsbench.sim.physics import Physics
 from tsbench.tasks import laikago
 from tsbench.tasks.laikago import Laikago, LaikagoState
 from tsbench.testing.episodes import Case, compare, ending

@@ -17,7 +17,7 @@ from tsbench import TsbenchError, tasks
 from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.core.state import Start
 from tsbench.planning.path import Path
-from tsbench.sim.batched import Physics
+from tsbench.sim.physics import Physics
 from tsbench.tasks.rocket import Rocket, RocketState
 from tsbench.testing.episodes import Case, compare, ending
 

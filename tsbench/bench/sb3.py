@@ -41,9 +41,9 @@ from tsbench.runs.config import compose
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.execute import prepare
 from tsbench.runs.workspace import RunWorkspace
-from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.gym import GymEnvironment
+from tsbench.sim.physics import Physics
 from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
 

@@ -26,9 +26,10 @@ from tsbench import tasks
 from tsbench.bench import Findings, comparison
 from tsbench.bench.turns import Case, Effort, take_turns
 from tsbench.core.task import MDP, Task
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.gym import GymEnvironment
 from tsbench.sim.kinematic import Planning
+from tsbench.sim.physics import Physics
 from tsbench.sim.single import environment
 
 NOISE = 0.2  # standard deviation of actions: robots move, and stand for a while

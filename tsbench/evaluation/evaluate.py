@@ -17,10 +17,10 @@ from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import V1, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import robustness
 from tsbench.evaluation.score import Score, Summary
-from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
+from tsbench.sim.physics import Physics
 
 
 def evaluate(

@@ -22,8 +22,8 @@ from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import perturbed_starts
 from tsbench.evaluation.score import Score
-from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import Episodes, play
+from tsbench.sim.physics import Physics
 
 SAME_REWARD = 1e-12  # of itself, from kernel to kernel; another physics is farther off
 

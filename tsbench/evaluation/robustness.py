@@ -12,8 +12,8 @@ from scipy.stats import binomtest
 from tsbench.core.state import Start
 from tsbench.core.task import Task
 from tsbench.evaluation.protocol import REFERENCE_MASS, Protocol
-from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
+from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push, direction
 
 # Pushes that are played side by side. Each rocket takes 15 MB of address space; more are no faster.

@@ -12,9 +12,10 @@ from tsbench.core.task import SimulatedTask
 from tsbench.core.typed import typed_items
 from tsbench.rl.ppo import Learner, Report
 from tsbench.rl.settings import PPOSettings
-from tsbench.sim.batched import BatchedEnvironment, Physics
+from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
+from tsbench.sim.physics import Physics
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import numpy as np
 
 from tsbench.core.state import Rng, S
 from tsbench.core.task import SimulatedTask
-from tsbench.sim.batched import Physics
 from tsbench.sim.change import Change
+from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push, direction
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from tsbench.core.arrays import step_of
 from tsbench.core.state import S
 from tsbench.core.task import MDP
-from tsbench.sim.batched import Dynamics, expect_finite
+from tsbench.sim.dynamics import Dynamics, expect_finite
 
 PolicyFunction = Callable[[np.ndarray], np.ndarray]  # observations (n, o) -> actions (n, a)
 

@@ -17,8 +17,8 @@ from dm_control.rl import control
 from tsbench.core.arrays import Array, step_of
 from tsbench.core.state import Readings, State
 from tsbench.core.task import MDP, SimulatedTask
-from tsbench.sim.batched import expect_finite, expect_shape
 from tsbench.sim.change import Change
+from tsbench.sim.dynamics import expect_finite, expect_shape
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import UNSTABLE, sensor_slices
 from tsbench.sim.push import Push

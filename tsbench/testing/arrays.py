@@ -19,9 +19,9 @@ from tsbench import tasks
 from tsbench.core.motion import ReferenceMotion
 from tsbench.core.state import Readings, State
 from tsbench.core.task import Plannable, Task
-from tsbench.sim.batched import Physics
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.model import sensor_slices
+from tsbench.sim.physics import Physics
 from tsbench.testing.episodes import reference_of
 
 COUNT = 48

@@ -15,8 +15,8 @@ from tsbench import tasks
 from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.core.state import Start, State
 from tsbench.core.task import Plannable, SimulatedTask, plannable
-from tsbench.sim.batched import Physics
 from tsbench.sim.kinematic import naive_plan
+from tsbench.sim.physics import Physics
 from tsbench.sim.single import Adapter, environment
 
 Actions = Callable[[], np.ndarray]  # the action of each step in turn

@@ -16,9 +16,9 @@ from tsbench.core.policy import Policy
 from tsbench.core.state import Readings, S, State
 from tsbench.core.task import Task, plannable
 from tsbench.evaluation.evaluate import check_fit
-from tsbench.sim.batched import Physics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.model import sensor_slices
+from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push
 
 Array = NDArray[np.float64]
