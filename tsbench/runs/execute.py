@@ -7,25 +7,18 @@ import hashlib
 import io
 import json
 import os
-import platform
 import shutil
 import signal
-import subprocess
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, replace
-from importlib.metadata import PackageNotFoundError, version
-from importlib.resources import files
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 
 from tsbench import methods, tasks
-from tsbench.core import plugins
 from tsbench.core.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
 from tsbench.core.files import PART, taken, write_json, write_whole
 from tsbench.core.method import Problem
@@ -38,31 +31,8 @@ from tsbench.rl.threads import one_thread
 from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.runs.progress import progress_bar
+from tsbench.runs.provenance import check_provenance, identity, write_provenance
 from tsbench.runs.workspace import RunWorkspace
-from tsbench.sim.model import compiled_hash
-
-PACKAGE = Path(str(files("tsbench")))
-# What can change a number in a run.
-PACKAGES = (
-    "dm-control",
-    "gymnasium",
-    "hydra-core",
-    "mink",
-    "mujoco",
-    "numpy",
-    "rsl-rl-lib",
-    "scipy",
-    "torch",
-    "tsbench",
-)
-_NAMES = {  # of what has to stay the same, in words
-    "configuration": "configuration",
-    "python": "version of Python",
-    "packages": "version of a package",
-    "code": "version of tsbench's own code",
-    "plug-ins": "version of a plug-in",
-    "physics": "model of the task",
-}
 
 
 def prepare(config: RunConfig) -> Problem:
@@ -109,7 +79,7 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
         _create(run)
     with _locked(run.path), _explained(run):
         try:
-            _write_provenance(run, config, problem, words)
+            write_provenance(run, config, problem, words)
             line = f"{' '.join(['tsbench run', *words])} -> {run.path}"
             return _work(config, problem, run, line, console or Console())
         except (TsbenchError, OSError) as error:
@@ -134,7 +104,7 @@ def resume(directory: Path, console: Console | None = None) -> Score:
             raise TsbenchError(f"{directory} holds a finished run: there is nothing to resume")
         config = replace(run.config(), directory=str(directory))
         problem = prepare(config)
-        _check_provenance(run, config, problem)
+        check_provenance(run, config, problem)
         with _explained(run):
             for path in directory.rglob(f"*{PART}"):
                 path.unlink(missing_ok=True)
@@ -166,12 +136,12 @@ def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
 def _work(
     config: RunConfig, problem: Problem, run: RunDirectory, line: str, console: Console
 ) -> Score:
-    identity = json.dumps(_identity(config, problem), sort_keys=True)
+    said = json.dumps(identity(config, problem), sort_keys=True)
     workspace = RunWorkspace(
         run.path,
         console,
         interval=config.checkpoint,
-        run=hashlib.sha256(identity.encode()).hexdigest(),
+        run=hashlib.sha256(said.encode()).hexdigest(),
     )
     with closing(workspace), signals(workspace.stop), memory_errors(), one_thread():
         workspace.note(line)
@@ -290,75 +260,3 @@ def _leave_as_found(directory: Path, found: set[Path] | None) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def _write_provenance(
-    run: RunDirectory, config: RunConfig, problem: Problem, words: Sequence[str]
-) -> None:
-    """Writes what is needed to repeat the run: versions.json, and config.yaml, which comes last:
-    its presence says that the run has begun."""
-    versions = {
-        **_identity(config, problem),
-        "platform": platform.platform(),
-        "commit": _commit(),
-    }
-    run.versions_file.unlink(missing_ok=True)
-    write_json(run.versions_file, versions)
-    command = " ".join(["tsbench run", *words])
-    content = yaml.safe_dump(asdict(config), sort_keys=False)
-    write_whole(run.config_file, f"# {command}\n{content}".encode())
-
-
-def _identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
-    """All that decides what a run gives, to the last bit, on one kind of machine."""
-    code = hashlib.sha256()
-    for path in sorted(PACKAGE.rglob("*.py")):
-        code.update(path.read_bytes())
-    configuration = json.dumps(config.identity, sort_keys=True)
-    brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
-    foreign = sorted(one for one in brought if one not in (None, plugins.own()))
-    return {
-        "configuration": hashlib.sha256(configuration.encode()).hexdigest(),
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
-        "code": code.hexdigest(),
-        "plug-ins": {
-            provider.distribution: {"version": provider.version, "code": provider.code()}
-            for provider in foreign
-        },
-        "physics": {problem.task.name: compiled_hash(problem.task.spec())},
-    }
-
-
-def _check_provenance(run: RunDirectory, config: RunConfig, problem: Problem) -> None:
-    """
-    Raises:
-        TsbenchError: a run begun as `versions.json` says would not go on to the same bits now.
-    """
-    before = run.versions()
-    for name, now in _identity(config, problem).items():
-        if before.get(name) != now:
-            raise TsbenchError(
-                f"{run.path} was begun with another {_NAMES[name]} (see {run.versions_file}), "
-                "so an exact resume is impossible: begin it again elsewhere"
-            )
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _commit() -> str | None:
-    """The commit of the checkout that tsbench lies in, with "+" when it has been changed."""
-    root = PACKAGE.parent
-    if not (root / ".git").exists() or shutil.which("git") is None:
-        return None
-    git = ["git", "-C", str(root)]
-    commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True)
-    changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True)
-    if commit.returncode:
-        return None
-    return commit.stdout.strip() + ("+" if changes.stdout else "")

@@ -1,0 +1,121 @@
+"""What a run was made from: all that decides what it gives, to the last bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tsbench import methods, tasks
+from tsbench.core import plugins
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import write_json, write_whole
+from tsbench.core.method import Problem
+from tsbench.runs.config import RunConfig
+from tsbench.runs.directory import RunDirectory
+from tsbench.sim.model import compiled_hash
+
+PACKAGE = Path(str(files("tsbench")))
+# What can change a number in a run.
+PACKAGES = (
+    "dm-control",
+    "gymnasium",
+    "hydra-core",
+    "mink",
+    "mujoco",
+    "numpy",
+    "rsl-rl-lib",
+    "scipy",
+    "torch",
+    "tsbench",
+)
+_NAMES = {  # of what has to stay the same, in words
+    "configuration": "configuration",
+    "python": "version of Python",
+    "packages": "version of a package",
+    "code": "version of tsbench's own code",
+    "plug-ins": "version of a plug-in",
+    "physics": "model of the task",
+}
+
+
+def write_provenance(
+    run: RunDirectory, config: RunConfig, problem: Problem, words: Sequence[str]
+) -> None:
+    """Writes what is needed to repeat the run: versions.json, and config.yaml, which comes last:
+    its presence says that the run has begun."""
+    versions = {
+        **identity(config, problem),
+        "platform": platform.platform(),
+        "commit": _commit(),
+    }
+    run.versions_file.unlink(missing_ok=True)
+    write_json(run.versions_file, versions)
+    command = " ".join(["tsbench run", *words])
+    content = yaml.safe_dump(asdict(config), sort_keys=False)
+    write_whole(run.config_file, f"# {command}\n{content}".encode())
+
+
+def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
+    """All that decides what a run gives, to the last bit, on one kind of machine."""
+    code = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        code.update(path.read_bytes())
+    configuration = json.dumps(config.identity, sort_keys=True)
+    brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
+    foreign = sorted(one for one in brought if one not in (None, plugins.own()))
+    return {
+        "configuration": hashlib.sha256(configuration.encode()).hexdigest(),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "code": code.hexdigest(),
+        "plug-ins": {
+            provider.distribution: {"version": provider.version, "code": provider.code()}
+            for provider in foreign
+        },
+        "physics": {problem.task.name: compiled_hash(problem.task.spec())},
+    }
+
+
+def check_provenance(run: RunDirectory, config: RunConfig, problem: Problem) -> None:
+    """
+    Raises:
+        TsbenchError: a run begun as `versions.json` says would not go on to the same bits now.
+    """
+    before = run.versions()
+    for name, now in identity(config, problem).items():
+        if before.get(name) != now:
+            raise TsbenchError(
+                f"{run.path} was begun with another {_NAMES[name]} (see {run.versions_file}), "
+                "so an exact resume is impossible: begin it again elsewhere"
+            )
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that tsbench lies in, with "+" when it has been changed."""
+    root = PACKAGE.parent
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        return None
+    git = ["git", "-C", str(root)]
+    commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True)
+    changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True)
+    if commit.returncode:
+        return None
+    return commit.stdout.strip() + ("+" if changes.stdout else "")
