@@ -4,6 +4,7 @@
 # make setup    the virtual environment .venv with the pinned packages
 # make faults   set up, then kill, starve and poison runs: N=50 kills, and every other fault once
 # make bench    speed of the batched simulation
+# make compare  the same beside other libraries, such as ARGS='--only sb3'
 # make clean    remove what was made here, but not runs/
 #
 # `make run` hands all its key=value words to `tsbench run`; those in capitals are for make:
@@ -29,7 +30,7 @@ quoted = '$(subst ','\'',$(call plain,$1))'
 given = $(filter-out ARGS=% PYTHON=% N=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
 words = $(if $(filter task=%,$(given)),,task=laikago_trot) $(foreach word,$(given),$(call quoted,$(word)))
 
-.PHONY: help setup system run test check format faults bench clean
+.PHONY: help setup system run test check format faults bench compare clean
 
 help:
 	@sed -n 's/^# \(make .*\)/  \1/p' Makefile
@@ -72,8 +73,11 @@ N ?= 50
 faults: setup
 	$(BIN)/python tests/faults.py --kills $(N) $(ARGS)
 
-bench: setup $(EXTRAS)
+bench: setup
 	@$(BIN)/tsbench bench $(ARGS)
+
+compare: setup $(EXTRAS)
+	@$(BIN)/python benchmarks/compare.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) build dist screenshots .mypy_cache .pytest_cache .ruff_cache .hypothesis

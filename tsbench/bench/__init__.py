@@ -1,7 +1,8 @@
 """How fast tsbench is, and what else is: ratios measured side by side in one run.
 
 A comparison is one file here: a docstring whose first line says what is compared, and a function
-with `@comparison("NAME")`. There is no list to edit; `tsbench bench --only NAME` finds it.
+with `@comparison("NAME")`. There is no list to edit; `tsbench bench --only NAME` finds it. Those
+with libraries that tsbench does not need lie in benchmarks/, beside the package.
 """
 
 from __future__ import annotations

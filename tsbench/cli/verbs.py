@@ -426,7 +426,7 @@ def _report(words: Sequence[str]) -> None:
 
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
-    parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago or sb3")
+    parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
     parser.add_argument("--quick", action="store_true", help="a minute, with larger ranges")
     options = parser.parse_args(words)
     from tsbench import bench
