@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any
 
 # Before numpy and torch are loaded, here and in the commands that tests start: the tests run side
 # by side, and threads that wait for each other's cores slow a small network down tenfold.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -24,29 +22,11 @@ from tsbench.evaluation.robustness import Robustness, Surface
 from tsbench.evaluation.score import Score, Summary
 from tsbench.runs.directory import Record, Stage
 from tsbench.testing.episodes import plan_of, reference_of
+from tsbench.testing.rounding import perturbed
 
 # How fast a machine is, or how busy, is no property of the code.
 settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any")
-
-
-@contextmanager
-def perturbed(size: float) -> Iterator[None]:
-    """Every new network begins with weights that differ by a relative `size`, always in the same
-    way: what another processor's rounding does to a training, it does to these."""
-    from rsl_rl.models import MLPModel  # takes seconds, which few tests need
-
-    init = MLPModel.__init__
-
-    def begin(self: MLPModel, *arguments: Any, **options: Any) -> None:
-        init(self, *arguments, **options)
-        rng = np.random.default_rng(0)
-        for parameter in self.parameters():
-            parameter.detach().numpy()[...] *= 1.0 + size * rng.normal(size=parameter.shape)
-
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(MLPModel, "__init__", begin)
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -36,7 +36,7 @@ ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 # Where packages may be imported: in a room, or in one file of it.
 ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl", "testing"},
-    "rsl_rl": {"rl"},
+    "rsl_rl": {"rl", "testing"},
     "tensordict": {"rl"},
     "threadpoolctl": {"rl", "evaluation.origin"},
     "gymnasium": {"sim.gym", "gym", "bench"},
