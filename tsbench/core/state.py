@@ -1,4 +1,4 @@
-"""What passes between a task and what steps it: states, starts and sensor readings."""
+"""States, starts and sensor readings: the data that a task and its simulation exchange."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class State:
-    """What a task knows at one time step; every field has the same leading batch axes.
+    """The state of a task at one time step; every field has the same leading batch axes.
 
     Attributes:
         time: seconds since the start of the episode, shape (...,).
@@ -50,10 +50,10 @@ S = TypeVar("S", bound=State)
 
 @dataclass(frozen=True)
 class Start:
-    """Where episodes begin.
+    """The initial states of episodes.
 
     Attributes:
-        time: seconds, shape (n,). Zero but in training that starts along a reference motion.
+        time: seconds, shape (n,). Zero, except in training that starts along a reference motion.
         qpos: generalised positions, shape (n, nq).
         qvel: generalised velocities, shape (n, nv).
         memory: what `Plant.control` remembers, shape (n, m).
@@ -77,14 +77,14 @@ class Start:
 
 @dataclass(frozen=True)
 class Readings:
-    """What the physics tells the task after a control step.
+    """The quantities that a task reads from the physics after a control step.
 
     Attributes:
         time: seconds since the start of the episode, shape (...,).
         qpos: generalised positions, shape (..., nq).
         qvel: generalised velocities, shape (..., nv).
-        sensors: the MJCF's sensors by name, each (..., dim), current at qpos and qvel. Only
-            position and velocity sensors are: those of the acceleration stage lag a substep.
+        sensors: values of the MJCF's sensors by name, each (..., dim). Position and velocity
+            sensors are current at qpos and qvel; acceleration sensors lag by one substep.
         memory: what `Plant.control` remembers, shape (..., m).
     """
 
