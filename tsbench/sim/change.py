@@ -1,4 +1,4 @@
-"""Changes to the physics: what a policy meets when the world is not quite its own."""
+"""Changes to the physics that a policy was trained in."""
 
 from __future__ import annotations
 
@@ -29,5 +29,5 @@ class Change:
         model.actuator_gainprm *= self.strength
         model.actuator_biasprm *= self.strength
         model.actuator_forcerange *= self.strength
-        # What the compiler derived from masses: weights of subtrees, inertias at rest.
+        # Recompute the values that the compiler derives from masses: weights of subtrees, inertias.
         mujoco.mj_setConst(model, mujoco.MjData(model))

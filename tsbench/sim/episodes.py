@@ -28,11 +28,11 @@ class Episodes(Generic[S]):
         violated: whether something spoiled it on the way, shape (n,). Its physics having diverged,
             which ends it with a reward of zero for that step, does.
         diverged: whether that happened, shape (n,).
-        cut: whether it ended for a reason other than its goal or its last step, shape (n,).
+        cut: whether the episode ended for a reason other than its goal or its last step, (n,).
         credit: what the spared steps earn (`MDP.credit`), shape (n,).
         final: the last state of each episode.
-        states: what `record` made of every state, start included, shape (T + 1, n, ...), each
-            episode's last one repeated after its end; None without `record`.
+        states: results of `record` for every state, start included, shape (T + 1, n, ...); the last
+            one is repeated after an episode's end. None without `record`.
         actions: as they were applied, shape (T, n, action_size), zero once an episode has ended.
         max_reward: per time step.
     """
@@ -52,14 +52,13 @@ class Episodes(Generic[S]):
 
     @property
     def returns(self) -> np.ndarray:
-        """Undiscounted, shape (n,). The steps missing from an episode that arrived at its goal are
-        credited, those missing from any other count as nothing."""
+        """Undiscounted returns, shape (n,). They include the credit of steps spared by arrivals."""
         total: np.ndarray = self.rewards.sum(axis=0) + self.credit
         return total
 
     @property
     def normalized(self) -> np.ndarray:
-        """Returns over the largest conceivable one, shape (n,)."""
+        """Returns divided by the return of `max_reward` in every step, shape (n,)."""
         return self.returns / (self.max_reward * self.limits)
 
     @property
@@ -82,14 +81,14 @@ def play(
     """Plays `count` episodes.
 
     Args:
-        mdp: what is played.
-        dynamics: what steps it.
-        policy: sees only the episodes that have not ended.
-        count: of episodes.
-        seed: of their starts.
-        record: what to keep of all states.
-        begin: the states to go on from instead of new starts; `dynamics` must be there.
-        delay: steps between an action's observation and its use; zero actions come before it.
+        mdp: the task or variant to play.
+        dynamics: the dynamics that step it.
+        policy: gets the observations of only the episodes that have not ended.
+        count: number of episodes.
+        seed: seed of the starts.
+        record: function of the state whose results are kept for all states.
+        begin: states to continue from instead of new starts; `dynamics` must be in these states.
+        delay: time steps from an observation to the use of its action; actions are zero until then.
 
     Raises:
         NotFiniteError: a number in action, state or reward is not finite.
