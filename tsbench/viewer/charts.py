@@ -38,9 +38,9 @@ def svg(figure: Figure, name: str, timed: Sequence[Axes] = ()) -> str:
     """A figure as an element of an HTML page.
 
     Args:
-        figure: what to draw.
-        name: of the chart, unique in the page.
-        timed: its panels whose x axis is the show's time; on them the page draws a playhead.
+        figure: the figure.
+        name: name of the chart, unique in the page.
+        timed: panels whose x axis is the show's time; the page draws a playhead on them.
     """
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": name}):
         text = io.StringIO()
@@ -58,7 +58,7 @@ def svg(figure: Figure, name: str, timed: Sequence[Axes] = ()) -> str:
 
 
 def contacts(bands: Sequence[Band], duration: float) -> str:
-    """When each foot was to stand and stood, planned above executed."""
+    """The planned and the executed contact times of each foot, planned above executed."""
     figure, panel = _figure(0.34 * len(bands) + 0.7)
     for row, band in enumerate(bands):
         for spans, colour, low in (
@@ -73,7 +73,7 @@ def contacts(bands: Sequence[Band], duration: float) -> str:
 
 
 def rewards(recording: Recording, plan: Recording | None) -> str:
-    """The terms of each step's reward, and the whole."""
+    """The terms of each step's reward, and their combination."""
     names = list(recording.reward_terms)
     lines = [(EXECUTED_COLOUR, recording)]
     if plan is not None:
@@ -89,7 +89,7 @@ def rewards(recording: Recording, plan: Recording | None) -> str:
 
 
 def joints(recording: Recording, plan: Recording) -> str:
-    """The position of every joint of one degree of freedom, planned and executed."""
+    """The planned and executed position of every joint with one degree of freedom."""
     model = recording.task.spec().compile()
     lines: dict[str, list[Line]] = {}
     for index in range(model.njnt):
@@ -109,10 +109,10 @@ def joints(recording: Recording, plan: Recording) -> str:
 
 
 def robustness(surface: Surface, timestep: float) -> str:
-    """The share of pushes that the robot survives, by force and direction and by force and when.
+    """The share of survived pushes, by force and direction, and by force and start time.
 
     Args:
-        surface: every push, and whether it was survived.
+        surface: every push, and whether the robot survived it.
         timestep: seconds of a control step.
     """
     survived = np.asarray(surface.survived, float)
@@ -130,7 +130,7 @@ def robustness(surface: Surface, timestep: float) -> str:
         image = panel.imshow(
             share, origin="lower", aspect="auto", vmin=0.0, vmax=1.0, cmap="cividis"
         )
-        every = -(-len(ticks) // 8)  # more would overlap
+        every = -(-len(ticks) // 8)  # more than eight labels would overlap
         panel.set_xticks(range(0, len(ticks), every), ticks[::every])
         panel.set_yticks(range(len(forces)), [f"{force:.3g}" for force in forces])
         panel.set(xlabel=label, ylabel="force, N")
@@ -139,7 +139,7 @@ def robustness(surface: Surface, timestep: float) -> str:
 
 
 def learning(metrics: Path) -> str | None:
-    """Learning curves, None where there are none."""
+    """The learning curves, or None if the metrics hold no returns."""
     with matplotlib.rc_context(STYLE):
         figure = curves.figure(metrics)
     if figure is None:
