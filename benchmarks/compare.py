@@ -1,8 +1,8 @@
-"""`tsbench bench` with other libraries beside ours: `python benchmarks/compare.py --only NAME`.
+"""`tsbench bench` with comparisons to other libraries: `python benchmarks/compare.py --only NAME`.
 
-Each file `against_*.py` here registers comparisons, as the files of `tsbench/bench` do. They lie
-outside the package because they need libraries that no user of tsbench does: `pip install
-'tsbench[bench]'`.
+Each file `against_*.py` in this folder registers comparisons, as the files of `tsbench/bench` do.
+They are outside the package because they need libraries that tsbench does not need:
+`pip install 'tsbench[bench]'`.
 """
 
 from __future__ import annotations
