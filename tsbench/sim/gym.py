@@ -1,10 +1,10 @@
 """Tasks and their variants as Gymnasium environments, one at a time or many at once.
 
-Both are thin wrappers of the environments that tsbench itself uses, and give the same floats.
-An episode that ends at its goal spares the remaining steps, and a score counts these as perfect
-ones. At the end of an episode, `info["spared"]` is their number. A learner that ignores it treats
-an arrival like a fall, so hovering just outside the goal earns more than arriving.
-Random starts are drawn from `np_random`.
+Both classes wrap the environments that tsbench itself uses, and return the same floats.
+Some tasks end an episode when the robot arrives at the goal. The score counts the remaining steps,
+which the arrival spares, as perfect steps. When an episode ends, `info["spared"]` gives their
+number. A learner that ignores it treats an arrival like a fall, and earns more by hovering just
+outside the goal. Random starts are drawn from `np_random`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ HEIGHT, WIDTH = 480, 640  # pixels
 
 
 def spaces(mdp: MDP[Any]) -> tuple[Box, Box]:
-    """The spaces of observations, unbounded float64, and of actions, the box [-1, 1] in float32,
-    which learners expect. Environments do not round float64 actions."""
+    """The spaces of observations (any float64) and of actions (the box [-1, 1]).
+
+    The action space is float32, which learners expect. Environments take float64 actions too.
+    """
     observation = Box(-np.inf, np.inf, (mdp.observation_size,), np.float64)
     return observation, Box(-1.0, 1.0, (mdp.action_size,), np.float32)
 
@@ -36,19 +38,22 @@ def spaces(mdp: MDP[Any]) -> tuple[Box, Box]:
 class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """A dm_control environment of tsbench as a `gymnasium.Env`.
 
-    `terminated` is an ending for a reason other than the last step, `truncated` the last step.
-    At the end `info["spared"]` counts the steps that an arrival at the goal spares. After a reset
-    with a seed the episodes are those of `tsbench.load(..., seed=seed)`.
+    `truncated` means that the episode ended at its last step, `terminated` that it ended for
+    another reason. At the end `info["spared"]` counts the steps that an arrival at the goal spares.
+    After `reset(seed=seed)` the episodes are those of `tsbench.load(..., seed=seed)`.
 
     Attributes:
-        single: the wrapped environment.
+        single: the wrapped dm_control environment.
     """
 
     def __init__(self, single: Environment, render_mode: str | None = None) -> None:
-        """`render_mode` must be "rgb_array" for `render` to give pictures.
+        """
+        Args:
+            single: the environment to wrap.
+            render_mode: "rgb_array" lets `render` draw pictures; None does not.
 
         Raises:
-            TsbenchError: unknown render mode.
+            TsbenchError: the render mode is unknown.
         """
         if render_mode not in (None, *RENDER_MODES):
             raise unknown("render mode", str(render_mode), RENDER_MODES)
@@ -76,8 +81,7 @@ class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         return observation, time_step.reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The picture of the model's first camera, uint8, shape (480, 640, 3); None without a
-        mode."""
+        """The picture of the model's first camera, shape (480, 640, 3); None without a mode."""
         if self.render_mode is None:
             return None
         picture: np.ndarray = self.single.physics.render(HEIGHT, WIDTH, camera_id=0)
@@ -91,11 +95,11 @@ class GymVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """A batched environment as a `gymnasium.vector.VectorEnv`.
 
     Its autoreset mode is *same step*: where an episode ends, `step` returns the first observation
-    of the next episode, and `infos["final_obs"]` holds the last observation of the ended one (an
-    array of objects, None where no episode ended; `infos["_final_obs"]` says where one did).
+    of the next episode. `infos["final_obs"]` holds the last observation of the ended one, in an
+    array of objects with None where no episode ended; `infos["_final_obs"]` marks the ended ones.
 
     Attributes:
-        batched: the wrapped environments.
+        batched: the wrapped batched environment.
     """
 
     def __init__(self, batched: BatchedEnvironment[Any]) -> None:
@@ -112,7 +116,7 @@ class GymVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Starts all episodes; one seed determines them all.
 
         Raises:
-            TsbenchError: `options` are given. None exist, since episodes restart by themselves.
+            TsbenchError: `options` were given; none is supported.
         """
         if options:
             raise TsbenchError(f"reset takes no options, not {', '.join(options)}")
