@@ -21,7 +21,7 @@ COUNT = 3
 
 
 def actions_of(steps: int, size: int) -> np.ndarray:
-    """(steps, COUNT, size), none positive: Laikago trips, a rocket without main engine falls."""
+    """Actions (steps, COUNT, size) that are not positive: Laikago trips, and the rocket falls."""
     return np.random.default_rng(7).uniform(-1.0, 0.0, (steps, COUNT, size))
 
 
@@ -98,7 +98,7 @@ def test_an_arrival_spares_steps() -> None:
 
 
 def test_the_last_step_truncates() -> None:
-    """1.5 times the 15 planner's steps (of 0.05 s) to a goal 3 m away are 39 of 0.02 s."""
+    """The horizon is 1.5 times the planner's flight time: 39 steps of 0.02 s to a goal 3 m away."""
     coated = GymEnvironment(tsbench.load("rocket_navigation", distance=3.0))
     coated.reset(seed=0)
     hover = np.array([[0.5, 0.0], [0.0, 0.0]])  # least thrust every other step
