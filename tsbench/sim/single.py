@@ -61,7 +61,8 @@ class Adapter(control.Task):
         expect_finite(np.array([self._steps]), self._previous, self._action)
 
     def get_observation(self, physics: dm_mujoco.Physics) -> OrderedDict[str, np.ndarray]:
-        return OrderedDict({control.FLAT_OBSERVATION_KEY: self.mdp.observation(self.state)[0]})
+        observation = self.mdp.observation(self.state)[0]  # may be a part of the state
+        return OrderedDict({control.FLAT_OBSERVATION_KEY: observation.copy()})
 
     def get_reward(self, physics: dm_mujoco.Physics) -> float:
         return float(self.mdp.reward(self._previous, self._action, self.state)[0])
