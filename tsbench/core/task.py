@@ -134,7 +134,8 @@ class Plant(ABC, Generic[S]):
 
     @abstractmethod
     def spec(self) -> mujoco.MjSpec:
-        """The model, with goal and obstacles in it."""
+        """The model, with goal and obstacles in it. The viewer frames and labels what is named
+        `goal` (a site) and `obstacle_1`, `obstacle_2`, ... (spheres)."""
 
     @abstractmethod
     def control(self, state: S, action: Array) -> tuple[Array, Array]:
