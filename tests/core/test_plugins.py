@@ -227,6 +227,15 @@ def test_the_code_of_a_plugin(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None
         sys.modules.pop("toy", None)
 
 
+@pytest.mark.parametrize("part", ["task/toy_flight", "method/lazy"])
+def test_a_missing_configuration(part: str, toy: Toy, tmp_path: Path) -> None:
+    (toy.folder / "conf" / f"{part}.yaml").unlink()
+    done = call(tmp_path, *RUN)
+    kind, name = part.split("/")
+    line = f"tsbench: the {kind} {name!r} cannot be run: its package lacks conf/{part}.yaml\n"
+    assert (done.returncode, done.stderr) == (2, line)
+
+
 @pytest.mark.parametrize("file", ["__init__.py", "task.py"])
 def test_a_broken_plugin_breaks_nothing_else(file: str, toy: Toy, tmp_path: Path) -> None:
     (toy.folder / file).write_text("import nothing_of_that_name\n")

@@ -29,6 +29,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from tsbench import methods, tasks
 from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.method import Budget
@@ -236,6 +237,11 @@ def one_line_errors() -> Iterator[None]:
             raise TsbenchError(_flat(error)) from None
         missing = str(error.missing_cfg_file)
         parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
+        registry = {"task": tasks, "method": methods}.get(parts[0])
+        if registry is not None and parts[2] in registry.names():
+            raise TsbenchError(
+                f"the {parts[0]} {parts[2]!r} cannot be run: its package lacks conf/{missing}.yaml"
+            ) from None
         raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__
