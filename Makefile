@@ -3,11 +3,12 @@
 # make check    set up, then lint, format and types
 # make setup    the virtual environment .venv with the pinned packages
 # make faults   set up, then kill, starve and poison runs: N=50 kills, and every other fault once
-# make bench    speed of the batched simulation
-# make clean    remove what was made here, but not runs/
+# make bench    measure speed
+# make compare  measure speed beside other libraries, such as ARGS='--only sb3'
+# make clean    remove the files that make and the tests have made, but not runs/
 #
-# `make run` hands all its key=value words to `tsbench run`; those in capitals are for make:
-# ARGS for other words, such as ARGS='-m seed=0,1', N for faults, and PYTHON for the interpreter.
+# `make run` hands its key=value words to `tsbench run`. Words in capitals are for make: ARGS holds
+# other words, such as ARGS='-m seed=0,1', N the number of kills, PYTHON the interpreter.
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
@@ -20,8 +21,8 @@ PYTHON ?= $(firstword $(foreach name,python3.12 python3.11 python3,\
 	$(shell $(name) -c 'import sys; (3, 11) <= sys.version_info < (3, 13) and print("$(name)")' 2>/dev/null)))
 ARGS ?=
 
-# The words of the command line, each quoted for the shell. In MAKEOVERRIDES make has doubled every
-# dollar and backslash, and put a backslash before every space.
+# The words of the command line, each quoted for the shell. In MAKEOVERRIDES make doubles every
+# dollar and backslash, and puts a backslash before every space.
 empty :=
 space := $(empty) $(empty)
 plain = $(subst \\,\,$(subst $$$$,$$,$(subst <blank>,$(space),$1)))
@@ -29,7 +30,7 @@ quoted = '$(subst ','\'',$(call plain,$1))'
 given = $(filter-out ARGS=% PYTHON=% N=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
 words = $(if $(filter task=%,$(given)),,task=laikago_trot) $(foreach word,$(given),$(call quoted,$(word)))
 
-.PHONY: help setup system run test check format faults bench clean
+.PHONY: help setup system run test check format faults bench compare clean
 
 help:
 	@sed -n 's/^# \(make .*\)/  \1/p' Makefile
@@ -44,7 +45,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
-# What the benchmark compares with, which a run does not need.
+# The libraries that benchmarks/compare.py needs and a run does not.
 $(EXTRAS): $(STAMP)
 	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev,bench]'
 	@touch $@
@@ -52,7 +53,7 @@ $(EXTRAS): $(STAMP)
 run: setup
 	@$(BIN)/tsbench run $(words) $(ARGS)
 
-# Pictures and pages are tested with a software renderer and a headless browser.
+# The tests draw pictures with a software renderer, and pages with a headless browser.
 system:
 	@.ci/debian libosmesa6 chromium
 
@@ -72,8 +73,11 @@ N ?= 50
 faults: setup
 	$(BIN)/python tests/faults.py --kills $(N) $(ARGS)
 
-bench: setup $(EXTRAS)
+bench: setup
 	@$(BIN)/tsbench bench $(ARGS)
+
+compare: setup $(EXTRAS)
+	@$(BIN)/python benchmarks/compare.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) build dist screenshots .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,18 +1,16 @@
-"""What many tests share: plans and reference motions made without learning."""
+"""Fixtures that many tests share: plans, reference motions and records made without training."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any
 
-# Before numpy and torch are loaded, here and in the commands that tests start: the tests run side
-# by side, and threads that wait for each other's cores slow a small network down tenfold.
+# Set before numpy and torch are loaded, in the tests and in the commands that they start. Tests run
+# in parallel, and threads that wait for each other's cores slow a small network down tenfold.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -24,35 +22,17 @@ from tsbench.evaluation.robustness import Robustness, Surface
 from tsbench.evaluation.score import Score, Summary
 from tsbench.runs.directory import Record, Stage
 from tsbench.testing.episodes import plan_of, reference_of
+from tsbench.testing.rounding import perturbed
 
-# How fast a machine is, or how busy, is no property of the code.
+# The speed and the load of a machine are no property of the code.
 settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any")
 
 
-@contextmanager
-def perturbed(size: float) -> Iterator[None]:
-    """Every new network begins with weights that differ by a relative `size`, always in the same
-    way: what another processor's rounding does to a training, it does to these."""
-    from rsl_rl.models import MLPModel  # takes seconds, which few tests need
-
-    init = MLPModel.__init__
-
-    def begin(self: MLPModel, *arguments: Any, **options: Any) -> None:
-        init(self, *arguments, **options)
-        rng = np.random.default_rng(0)
-        for parameter in self.parameters():
-            parameter.detach().numpy()[...] *= 1.0 + size * rng.normal(size=parameter.shape)
-
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(MLPModel, "__init__", begin)
-        yield
-
-
 @pytest.fixture(scope="session", autouse=True)
 def another_rounding() -> Iterator[None]:
-    """With TSBENCH_TEST_PERTURB=1e-6 in the environment all learners of the session are perturbed
-    by that much: tests that pass only with one processor's rounding then fail."""
+    """TSBENCH_TEST_PERTURB=1e-6 perturbs all learners of the session by that much. Tests that pass
+    only with one processor's rounding then fail."""
     size = float(os.environ.get("TSBENCH_TEST_PERTURB", "0"))
     with perturbed(size) if size else nullcontext():
         yield
@@ -65,19 +45,19 @@ def perturbed_fixture() -> Callable[[float], AbstractContextManager[None]]:
 
 @pytest.fixture(scope="session")
 def naive_plan() -> Callable[[str], Plan]:
-    """Of a task: the plan that its hand-made planner makes."""
+    """A function from a task's name to the plan of its hand-made planner."""
     return plan_of
 
 
 @pytest.fixture(scope="session")
 def naive_reference() -> Callable[[str], ReferenceMotion]:
-    """Of a task: that plan as full poses."""
+    """A function from a task's name to its hand-made plan as full poses."""
     return reference_of
 
 
 @pytest.fixture(name="invented_record", scope="session")
 def invented_record_fixture() -> Callable[[str], Record]:
-    """Of a task: what could be in a run's score.json, though nothing was run."""
+    """A function from a task's name to an invented content of score.json."""
     return _invented_record
 
 

@@ -1,13 +1,13 @@
-"""The fault campaign: real runs are killed, starved and poisoned, and have to survive it.
+"""The fault campaign: kills, starves and poisons real runs, and checks that they recover.
 
     make faults            50 kills, and every other fault once
-    make faults N=3        what CI does
+    make faults N=3        3 kills and every other fault once, as in CI
 
-Runs are started by `verbs.main` in forked processes, which spares each of them some seconds of
-imports, and killed by signals from outside: in an iteration drawn at random or after the last one,
-and there after a random amount of processor time, which a busy machine does not change. After the
-kills a run is resumed until it ends, and what it leaves is compared with a run that was left alone:
-the bytes of policy, plan and reference, the metrics but for wall-clock, and the score.
+`verbs.main` starts the runs in forked processes, which saves each run some seconds of imports. A
+signal kills a run in an iteration drawn at random or after the last one, after a random amount of
+processor time, which does not depend on the load of the machine. Then the run is resumed until it
+ends, and its files are compared with those of an uninterrupted run: the bytes of policy, plan and
+reference, the metrics without wall-clock times, and the score.
 """
 
 from __future__ import annotations
@@ -72,21 +72,21 @@ INTERVALS = (0.0, 0.5, 1000.0)  # seconds between checkpoints
 KILLS = 5  # of one run at most
 PATIENCE = 600.0  # seconds, for a process that should end
 
-Check = tuple[str, bool, str]  # what, whether it went well, what was seen
+Check = tuple[str, bool, str]  # the fault, whether the run recovered, the observation
 
 
 class Process:
-    """`tsbench WORDS` in a process of its own."""
+    """`tsbench WORDS` in its own process."""
 
     def __init__(
         self, words: list[str], folder: Path, before: Callable[[], None] | None = None
     ) -> None:
-        """`before` is called in the new process, to damage it."""
+        """`before` is called in the new process and may damage it."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self.errors = folder / "stderr"
         self.status: int | None = None
-        self.cpu = 0.0  # seconds, once it has ended
+        self.cpu = 0.0  # seconds of processor time, known at the end
         self.pid = os.fork()
         if self.pid == 0:
             status = 1
@@ -125,7 +125,7 @@ class Process:
         return self.status is not None
 
     def until(self, event: Callable[[], bool]) -> bool:
-        """Waits; returns whether the event came before the end."""
+        """Waits for an event; returns whether it came before the process ended."""
         deadline = time.monotonic() + PATIENCE
         while not self.ended():
             if event():
@@ -137,16 +137,16 @@ class Process:
         return False
 
     def until_used(self, seconds: float) -> bool:
-        """Waits until it has used that much processor time; returns whether it came to that."""
+        """Waits until the process has used that much processor time; returns whether it did."""
         return self.until(lambda: self.used() >= seconds)
 
     def until_iterations(self, count: int) -> bool:
-        """Waits until it has reported that many; returns whether it came to that."""
+        """Waits until the run has recorded that many iterations; returns whether it did."""
         return self.until(lambda: iterations(self.folder) >= count)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Holds it still, so that nothing that is done to its files races with what it does."""
+        """Suspends the process, so that the test can change its files without a race."""
         os.kill(self.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, self.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
         try:
@@ -161,12 +161,12 @@ class Process:
         return self.status
 
     def line(self) -> str:
-        """What it said on the error stream."""
+        """The output on the error stream."""
         return self.errors.read_text().strip()
 
 
 def outcome(run: Path) -> dict[str, Any]:
-    """All that a run leaves, but for how long things took."""
+    """A run's policy, motions, metrics and score, without times."""
     files = [(run / name).read_bytes() for name in ("policy.safetensors", "policy.json")]
     for name in ("plan.npz", "reference.npz"):
         if (run / name).exists():
@@ -184,7 +184,7 @@ def outcome(run: Path) -> dict[str, Any]:
 
 
 def where(run: Path) -> str:
-    """What a run was doing, from what it has left."""
+    """The stage and iteration that a run had reached, from its files."""
     metrics = run / "metrics.jsonl"
     rows = metrics.read_text().splitlines() if metrics.exists() else []
     if not rows:
@@ -199,11 +199,13 @@ def where(run: Path) -> str:
 
 @dataclass
 class Campaign:
-    """Attributes:
-    folder: where everything is done.
-    random: of all draws.
-    checks: what was tried and how it went.
-    kills: in which stage, by run.
+    """The faults and their outcomes.
+
+    Attributes:
+        folder: the folder of all runs.
+        random: the generator of all random draws.
+        checks: the faults tried, and their outcomes.
+        kills: the stages in which each run was killed.
     """
 
     folder: Path
@@ -218,7 +220,7 @@ class Campaign:
         sys.stdout.flush()
 
     def uninterrupted(self, name: str) -> tuple[dict[str, Any], float]:
-        """What the run leaves when it is left alone, and the processor time that it takes."""
+        """The files of the uninterrupted run, and its processor time in seconds."""
         if name not in self.whole:
             folder = self.folder / f"whole {name}"
             process = Process(["run", *RUNS[name], "directory=run"], folder)
@@ -228,7 +230,7 @@ class Campaign:
         return self.whole[name]
 
     def kill(self, count: int) -> None:
-        """Kills runs that many times, at random moments, and compares what they end with."""
+        """Kills runs `count` times at random moments, resumes them and compares their files."""
         number = 0
         while self.kills.total() < count:
             name = list(RUNS)[number % len(RUNS)]
@@ -249,7 +251,7 @@ class Campaign:
                 target = self.random.randint(min(done + 1, total), total)
                 if not process.until_iterations(target):
                     break
-                # Within the next iteration, or in what comes after the last one.
+                # The kill falls into the next iteration, or into the work after the last one.
                 span = cost / 2 if target == total else cost / 2 / total
                 if not process.until_used(process.used() + self.random.uniform(0.0, span)):
                     break
@@ -286,7 +288,7 @@ class Campaign:
             self.ends(f"{number.name} after {kept} iterations", folder, said and saved, process)
 
     def full_disk(self) -> None:
-        """The disk is full in the midst of training; later there is room again."""
+        """The disk fills up during training, and has room again later."""
         folder = self.folder / "full disk"
         words = ["run", *RUNS[SUBJECT], "checkpoint=0", "directory=run"]
         if not can_mount():
@@ -304,7 +306,7 @@ class Campaign:
             self.ends("full disk (tmpfs of 400k)", folder, refused, process)
 
     def read_only(self) -> None:
-        """The place for checkpoints becomes read-only; later it can be written again."""
+        """The folder of the checkpoints becomes read-only, and is writable again later."""
         folder, process = self.begin("read-only", 0.0)
         process.until_iterations(3)
         with ExitStack() as stack:
@@ -325,7 +327,7 @@ class Campaign:
         self.check(f"read-only from the start ({kind})", refused and one_line, process.line())
 
     def vanished(self) -> None:
-        """The run's directory is removed under it."""
+        """The run's directory is removed during training."""
         folder, process = self.begin("vanished", 0.0)
         process.until_iterations(3)
         with process.paused():
@@ -334,7 +336,7 @@ class Campaign:
         self.check("vanished directory", refused, process.line())
 
     def no_memory(self) -> None:
-        """Too little from the start, and no more to be had in the midst of training."""
+        """Memory is too small from the start, or runs out during training."""
         many = ["task.budgets.smoke.environments=null", "task.training.plan.environments=3_000_000"]
         words = [*RUNS[SUBJECT], *many]
         folder = self.folder / "too large"
@@ -371,7 +373,7 @@ class Campaign:
         process.until_iterations(4)
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-        # Not what the kill has left half written.
+        # Without the line that the kill left half written.
         newest = sorted((folder / "run" / "checkpoints").glob("*.safetensors"))[-1]
         newest.write_bytes(newest.read_bytes()[:-1])
         self.ends("torn checkpoint", folder, True, process)
@@ -379,7 +381,7 @@ class Campaign:
         self.check("the log says so", said)
 
     def poisoned_model(self) -> None:
-        """Motors so strong that the physics cannot be computed: counted, and failed."""
+        """Motors so strong that the physics diverges: warnings are counted, and the run fails."""
 
         def poison() -> None:
             load = load_spec
@@ -480,7 +482,7 @@ class Campaign:
         return folder, Process(words, folder)
 
     def ends(self, what: str, folder: Path, good: bool, stopped: Process) -> None:
-        """Resumes a run and compares it with the one that was left alone."""
+        """Resumes a run and compares it with the uninterrupted one."""
         seen = f"exit {stopped.status}: {stopped.line()}"
         lines = len(stopped.line().splitlines())
         process = Process(["run", "resume=run"], folder)
@@ -494,7 +496,7 @@ class Campaign:
 
 
 def patch(name: str, value: Any) -> None:
-    """Replaces something of the program, in a process that is there to be damaged."""
+    """Replaces a function or value of the program, in a process that the test damages."""
     pytest.MonkeyPatch().setattr(name, value)
 
 
@@ -505,7 +507,7 @@ def iterations(folder: Path) -> int:
 
 @cache
 def can_mount() -> bool:
-    """Whether file systems can be mounted here, which takes root, and in a container more."""
+    """Whether this process may mount file systems, which needs root, and more in a container."""
     with tempfile.TemporaryDirectory() as folder:
         mount = ["mount", "-t", "tmpfs", "tmpfs", folder]
         if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
@@ -516,7 +518,7 @@ def can_mount() -> bool:
 
 @contextmanager
 def small_disk(folder: Path, size: str) -> Iterator[None]:
-    """A file system of that size."""
+    """Mounts a file system of that size."""
     folder.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder], check=True)
     try:
@@ -527,8 +529,8 @@ def small_disk(folder: Path, size: str) -> Iterator[None]:
 
 @contextmanager
 def read_only(folder: Path) -> Iterator[tuple[str, str]]:
-    """A folder in which nothing can be written: by a mount where one can, since permissions do not
-    bind root. Yields what was used, and what the system says."""
+    """Makes a folder read-only: by a mount if possible, since permissions do not bind root. Yields
+    the means used, and the system's error message."""
     if can_mount():
         subprocess.run(["mount", "--bind", folder, folder], check=True)
         try:

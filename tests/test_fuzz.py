@@ -1,4 +1,4 @@
-"""Input of every kind, at random: it is either right or refused in one line, and left as it was."""
+"""Random input of every kind: it is valid or refused in one line, and stays unchanged."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def intact(
     naive_reference: Callable[[str], ReferenceMotion],
     invented_record: Callable[[str], Record],
 ) -> Path:
-    """A run directory with something of everything in it. Not to be changed."""
+    """A run directory with a file of every kind, which no test may change."""
     folder = tmp_path_factory.mktemp("intact")
     task, rng = tasks.make(NAME), np.random.default_rng(0)
     naive_plan(NAME).save(folder / "plan.npz")
@@ -127,7 +127,7 @@ def test_intact_files_are_read(name: str, intact: Path) -> None:
 
 
 def damaged(data: st.DataObject, content: bytes) -> bytes:
-    """With some bytes replaced, left out or put in."""
+    """The content with some bytes replaced, removed or inserted."""
     start = data.draw(st.integers(0, len(content)))
     end = data.draw(st.integers(start, min(start + 40, len(content))) | st.just(len(content)))
     return content[:start] + data.draw(st.binary(max_size=8)) + content[end:]
@@ -150,7 +150,7 @@ def test_files_with_damage(
 
 
 def altered(data: st.DataObject, value: Any) -> Any:
-    """With something else in one place of nested mappings and lists."""
+    """The value with another one in one place of its nested mappings and lists."""
     if isinstance(value, dict) and value and data.draw(st.booleans()):
         key = data.draw(st.sampled_from(sorted(value)))
         if data.draw(st.integers(0, 5)) == 0:

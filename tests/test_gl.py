@@ -1,4 +1,4 @@
-"""Which OpenGL is picked on which machine."""
+"""The choice of the OpenGL library on different machines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tsbench.core.errors import TsbenchError
         ("linux", {"DISPLAY": ":0"}, {"EGL"}, None),
         ("linux", {"DISPLAY": ""}, {"EGL"}, "egl"),
         ("linux", {"WAYLAND_DISPLAY": "wayland-0"}, {"EGL"}, None),
-        ("linux", {"MUJOCO_GL": "osmesa"}, {"EGL"}, "osmesa"),  # the user's word is the last
+        ("linux", {"MUJOCO_GL": "osmesa"}, {"EGL"}, "osmesa"),  # the user's choice stays
         ("darwin", {}, {"EGL"}, None),
     ],
 )
@@ -33,7 +33,7 @@ def test_backend(
     chosen: str | None,
 ) -> None:
     for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.setenv(name, "")  # so that what choose_backend sets is undone too
+        monkeypatch.setenv(name, "")  # so that pytest also undoes the setting of choose_backend
         monkeypatch.delenv(name)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)

@@ -64,4 +64,4 @@ def test_stable_baselines3_learns_in_it(tmp_path: Path, monkeypatch: pytest.Monk
     learner.learn(128)
     assert learner.num_timesteps == 128
     assert not before.equal(learner.policy.state_dict()["action_net.weight"])
-    assert len(learner.ep_info_buffer or ()) >= 1  # the episodes that it saw end
+    assert len(learner.ep_info_buffer or ()) >= 1  # the finished episodes

@@ -15,7 +15,7 @@ import tsbench
 
 ROOT = Path(tsbench.__file__).parent
 
-# What each room may know, lowest first; a room is a package, or a file beside the packages.
+# The rooms that each room may import, lowest first. A room is a package or a file beside them.
 MAY_KNOW: dict[str, set[str]] = {
     "core": set(),
     "gl": {"core"},
@@ -30,13 +30,13 @@ MAY_KNOW: dict[str, set[str]] = {
     "viewer": {"core", "sim", "tasks", "evaluation", "runs"},
     "bench": {"core", "sim", "tasks", "rl", "methods", "evaluation", "runs"},
 }
-# The commands and the public faces: they may know everything.
+# The commands and the public interfaces may import every room.
 ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 
-# Where packages may be imported: in a room, or in one file of it.
+# The rooms, or single files of rooms, that may import each package.
 ONLY_IN: dict[str, set[str]] = {
     "torch": {"rl", "testing"},
-    "rsl_rl": {"rl"},
+    "rsl_rl": {"rl", "testing"},
     "tensordict": {"rl"},
     "threadpoolctl": {"rl", "evaluation.origin"},
     "gymnasium": {"sim.gym", "gym", "bench"},
@@ -53,7 +53,7 @@ ONLY_IN: dict[str, set[str]] = {
     "tensorboard": {"runs.events"},
     "rich": {"runs.progress", "runs.workspace", "runs.execute", "cli", "bench"},
 }
-# Where an import may wait until it is needed.
+# The rooms that may delay an import until they need it.
 STARTS_FAST = {"tsbench", "cli"}
 
 
@@ -110,7 +110,7 @@ def test_no_circles_within_a_room() -> None:
 
 
 def test_tasks_and_methods_do_not_know_their_like() -> None:
-    """A new one is one file; the package's own file finds it without knowing its name."""
+    """A new task or method is one file: the registry finds it, and no other file names it."""
     for package in ("tsbench.tasks", "tsbench.methods"):
         files = {name for name in MODULES if name.startswith(f"{package}.")}
         assert len(files) >= 2
@@ -126,7 +126,7 @@ def test_heavy_packages_stay_in_their_rooms() -> None:
 
 
 def test_imports_stand_at_the_top() -> None:
-    """A function-level import hides a circle, or makes a start fast where that matters."""
+    """An import within a function hides a cycle, except where it makes a command start fast."""
     for name, tree in MODULES.items():
         functions = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.Lambda))]
         inner = [other for function in functions for other in imported(function)]
@@ -134,7 +134,7 @@ def test_imports_stand_at_the_top() -> None:
 
 
 def test_evaluation_needs_no_learning() -> None:
-    """Nor does anything else of the public face load torch."""
+    """No part of the public interface loads torch."""
     program = (
         "import sys, tsbench, tsbench.evaluation.evaluate, tsbench.core.policy, tsbench.methods\n"
         "tsbench.load('rocket_navigation').reset()\n"

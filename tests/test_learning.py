@@ -1,5 +1,5 @@
-"""That the methods learn. Rounding decides the outcome of one training, and it differs between
-processors: what is asked for is a share of several, far from where chance would decide."""
+"""The methods learn. Rounding, which differs between processors, decides the outcome of a single
+training, so the tests ask for a share of several, far from the share that chance gives."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def test_most_trainings_fly_the_rocket_to_its_goal(tmp_path: Path) -> None:
 def test_the_switch_perturbs_every_network(
     perturbed: Callable[[float], AbstractContextManager[None]],
 ) -> None:
-    """By as much as was asked for, and always alike: see TSBENCH_TEST_PERTURB in conftest.py."""
+    """The perturbation has the given size and is always the same; see TSBENCH_TEST_PERTURB in
+    conftest.py."""
     planning = Planning(tasks.make("rocket_navigation", distance=3.0))
 
     def weights(around: AbstractContextManager[None]) -> dict[str, np.ndarray]:

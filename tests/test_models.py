@@ -1,7 +1,7 @@
 """The compiled models against the published figures.
 
 The two tables below are a second copy of those figures, made from the sources and not from the
-MJCF, so that a slip in either shows.
+MJCF, so that an error in either is found.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def test_laikago_joint_and_motor(leg: str, name: str) -> None:
 
 
 def test_laikago_is_complete() -> None:
-    """No link, joint, motor or sensor besides the expected ones, and in the promised order."""
+    """The model has exactly the expected links, joints, motors and sensors, in this order."""
     model = compiled("laikago")
     joints = [f"{leg}_{name}_joint" for leg in LEGS for name in JOINTS]
     assert [model.jnt(i).name for i in range(model.njnt)] == ["root", *joints]
@@ -267,9 +267,9 @@ def test_laikago_forward_kinematics(
 def test_laikago_legs_mirror_each_other(
     front: tuple[float, float, float], rear: tuple[float, float, float]
 ) -> None:
-    """Left legs at some angles, right legs at the mirrored ones: mirrored masses, but for calves.
+    """Left legs at some angles and right legs at the mirrored angles have mirrored masses.
 
-    The published calf (its CoM 0.4 mm off to the right on every leg) is no mirror image.
+    The calves are left out: the CoM of the published calf is 0.4 mm to the right on every leg.
     """
     model = compiled("laikago")
     data = mujoco.MjData(model)
@@ -324,7 +324,7 @@ def test_laikago_home_pose() -> None:
 
 
 def test_laikago_stands() -> None:
-    """Four seconds with the home pose as target: settled, level, on four feet that bear it all."""
+    """After 4 s with the home pose as target it is settled and level, and its feet bear it all."""
     model, data = home()
     start = data.sensor("com").data.copy()
     mujoco.mj_step(model, data, 4 * 600)
@@ -335,7 +335,7 @@ def test_laikago_stands() -> None:
 
     feet = {model.geom(f"{leg}_foot").id for leg in LEGS}
     assert {int(geom) for geom in data.contact.geom.ravel()} == {model.geom("floor").id, *feet}
-    # On level ground the vertical contact forces are what the generalised force lifts the root by.
+    # On level ground the root's vertical generalised force is the sum of the contact forces.
     assert data.qfrc_constraint[2] == pytest.approx(TOTAL_MASS * 9.81, rel=2e-3)
     for leg in LEGS:
         sole = data.sensor(f"{leg}_foot_position").data[2] - SOLE
@@ -353,7 +353,7 @@ def test_laikago_collapses_onto_its_trunk_without_motors() -> None:
 
 
 def test_laikago_kneels() -> None:
-    """Thighs straight down and calves folded up: the knees are lowest and meet the ground."""
+    """With thighs straight down and calves folded up, the knees are lowest and touch the ground."""
     model, data = home()
     data.qpos[2] = 0.25 + 0.02
     data.qpos[7:] = (0.0, 0.0, -2.7) * 4
@@ -363,7 +363,7 @@ def test_laikago_kneels() -> None:
 
 
 def test_laikago_repeats_bit_for_bit_from_its_state_alone() -> None:
-    """A state copied into fresh data goes on exactly as the original does."""
+    """A state copied into fresh data gives exactly the same further motion as the original."""
     model, first = home()
     first.ctrl[::3] += 0.3
     mujoco.mj_step(model, first, 200)
@@ -431,7 +431,7 @@ def test_rocket_terminal_speed(thrust: float, speed: float) -> None:
 
 
 def test_rocket_drag_works_sideways_too() -> None:
-    """Backward Euler on the drag alone: every step divides the speed by 1 + h drag / m."""
+    """By backward Euler on the drag alone, every step divides the speed by 1 + h drag / m."""
     model, data = rocket()
     data.qvel[0] = 3.0
     mujoco.mj_step(model, data, 50)
@@ -450,7 +450,8 @@ def test_rocket_spins_freely() -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.floats(-np.pi, np.pi), st.floats(0.0, 50.0), st.floats(-10.0, 10.0))
 def test_rocket_accelerations(angle: float, main: float, side: float) -> None:
-    """At rest: main along the body's z axis, side along minus its x axis, 0.365 m up."""
+    """At rest, the main engine pushes along the body's z axis, the side engine along minus its x
+    axis from 0.365 m up."""
     model, data = rocket()
     data.qpos[2], data.ctrl[:] = angle, (main, side)
     mujoco.mj_forward(model, data)
@@ -462,7 +463,7 @@ def test_rocket_accelerations(angle: float, main: float, side: float) -> None:
 
 
 def test_rocket_full_side_engine_turns_it_counter_clockwise() -> None:
-    """At 10 * 0.365 / 0.8 rad/s^2; the nose, first straight up, moves to the left."""
+    """The rocket turns at 10 * 0.365 / 0.8 rad/s^2; its nose, at first up, moves to the left."""
     model, data = rocket()
     data.ctrl[1] = 10.0
     mujoco.mj_forward(model, data)
@@ -475,7 +476,7 @@ def test_rocket_full_side_engine_turns_it_counter_clockwise() -> None:
 
 @pytest.mark.parametrize(("gap", "touches"), [(-0.01, True), (0.01, False)])
 def test_rocket_meets_obstacles_and_nothing_else(gap: float, touches: bool) -> None:
-    """A ball of radius 0.5 m to the right of the widest part, by the gap; and a ghost inside."""
+    """A ball of radius 0.5 m lies `gap` to the right of the hull, and a ghost inside the hull."""
     spec = load_spec("rocket")
     ball = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [0.5, 0.0, 0.0]}
     place = [17 / PIXELS_PER_METRE + 0.5 + gap, 0.0, -0.2]

@@ -1,4 +1,4 @@
-"""What is shipped, what is pinned, and what `make` hands on."""
+"""The files of the wheel, the pinned packages, and the words that `make` hands on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract tests find what they are there for: each fails on a task that breaks its promise."""
+"""Each contract test fails on a task that breaks the promise that it tests."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Make = Callable[..., str]
 
 @pytest.fixture
 def make(monkeypatch: pytest.MonkeyPatch) -> Make:
-    """Registers a short rocket task with other functions, and gives its name."""
+    """A function that registers a short rocket task with changed functions and returns its name."""
     monkeypatch.setattr(tasks, "_factories", dict(tasks._factories))
 
     def register(**functions: Callable[..., Any]) -> str:

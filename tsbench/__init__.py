@@ -67,17 +67,18 @@ def load(
     """One dm_control environment of a task.
 
     Args:
-        name: of the task.
-        variant: "planning" for its kinematic variant, "imitation" for the one whose reward
+        name: a task's name, as `list_tasks` gives it.
+        variant: "planning" for the kinematic variant, "imitation" for the variant whose reward
             follows `reference`, None for the task itself.
-        reference: what the imitation variant imitates.
-        seed: of the random starts, None for fresh entropy.
+        reference: the motion that the imitation variant follows.
+        seed: seed of the random starts; None draws fresh entropy.
         perturbed: whether episodes begin near the task's start instead of at it.
-        push: what disturbs every episode.
-        constants: changes to what defines the task, for studies.
+        push: a force that acts in every episode.
+        constants: changed constants of the task, for studies.
 
     Raises:
-        TsbenchError: an unknown name, or an imitation variant without a reference.
+        TsbenchError: a name or a constant is unknown, an argument has the wrong type or range, or
+            the variant lacks its reference or does not take the argument.
     """
     from tsbench.sim.single import environment
 
@@ -97,9 +98,15 @@ def load_batched(
     threads: int | None = None,
     **constants: Any,
 ) -> BatchedEnvironment[Any]:
-    """`count` environments of a task stepped together; arguments otherwise as in `load`.
+    """`count` environments of a task, stepped together; the other arguments as in `load`.
 
-    `threads` None means all cores; `push` may be another one for each environment.
+    Args:
+        count: number of environments, at least 1.
+        push: one push for all environments, or with a leading axis (count,) one for each.
+        threads: CPU threads of the physics; None takes all cores.
+
+    Raises:
+        TsbenchError: `count` is less than 1. Beyond that, as `load`.
     """
     from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.kinematic import Planning
@@ -121,19 +128,19 @@ def evaluate(
     protocol: str = "v1",
     threads: int | None = None,
 ) -> Score:
-    """Scores a policy by the evaluation protocol (`tsbench/evaluation/protocol.py`).
+    """Scores a policy by an evaluation protocol (`tsbench/evaluation/protocol.py`).
 
     Args:
-        policy: a `tsbench.core.policy.Policy`, the directory of one, an ONNX file, "zero" or "random",
-            a stable-baselines3 model, or any function of one observation (o,) that returns one
-            action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
+        policy: a `tsbench.core.policy.Policy`, the directory of one, an ONNX file, "zero" or
+            "random", a stable-baselines3 model, or any function of one observation (o,) that
+            returns one action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
             `tsbench.evaluation.foreign.from_sb3`.
         task: its name.
         protocol: "v1", or "smoke" for a first look that cannot be ranked.
-        threads: for the physics, None for all cores; the score does not depend on it.
+        threads: CPU threads of the physics; None takes all cores. The score does not depend on it.
 
     Raises:
-        TsbenchError: an unknown name, a policy for another task, or one that does not fit.
+        TsbenchError: a name is unknown, or the policy is for another task or does not fit.
     """
     from pathlib import Path
 

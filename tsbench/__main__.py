@@ -1,4 +1,4 @@
-"""`python -m tsbench` is `tsbench`."""
+"""Makes `python -m tsbench` the command `tsbench`."""
 
 import sys
 

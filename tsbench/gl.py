@@ -1,4 +1,4 @@
-"""Which OpenGL draws pictures; to be settled before mujoco or dm_control is imported."""
+"""Chooses the OpenGL library that draws pictures, before mujoco or dm_control is imported."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TRIAL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 def choose_backend() -> None:
     """Sets MUJOCO_GL on a machine without a display, unless the user has set it.
 
-    EGL if there is one, else OSMesa, else none: then everything works but pictures.
+    It takes EGL, else OSMesa. Without either, everything but pictures works.
     """
     if sys.platform != "linux" or "MUJOCO_GL" in os.environ:
         return
@@ -27,12 +27,12 @@ def choose_backend() -> None:
 
 
 def find_working_backend() -> None:
-    """Sets MUJOCO_GL to one that draws: what it says already if that works, else EGL or OSMesa.
+    """Sets MUJOCO_GL to a library that draws: its present value if that works, else EGL or OSMesa.
 
-    A library that is installed may still find nothing to draw on, which only a trial tells.
+    An installed library may still find no device to draw on, so each one is tried.
 
     Raises:
-        TsbenchError: none works.
+        TsbenchError: none of them works.
     """
     for backend in dict.fromkeys((os.environ.get("MUJOCO_GL"), "egl", "osmesa")):
         changes = {} if backend is None else {"MUJOCO_GL": backend}

@@ -1,4 +1,4 @@
-"""Every task as a Gymnasium environment: importing this module registers them.
+"""Registers every task as a Gymnasium environment when it is imported.
 
 import gymnasium
 import tsbench.gym
@@ -6,8 +6,8 @@ import tsbench.gym
 one = gymnasium.make("tsbench/laikago_trot-v1")
 many = gymnasium.make_vec("tsbench/laikago_trot-v1", num_envs=512)  # stepped together
 
-The number at the end is the task's version. Both take the arguments of `tsbench.load` too, such as
-`variant="planning"` or `perturbed=True`.
+The number at the end is the task's version. `make` and `make_vec` also take the arguments of
+`tsbench.load`, such as `variant="planning"` or `perturbed=True`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ __all__ = ["GymEnvironment", "GymVectorEnvironment", "identifier", "make", "make
 
 
 def identifier(name: str) -> str:
-    """What Gymnasium calls the task of that name.
+    """Gymnasium's identifier of the task of that name.
 
     Raises:
-        TsbenchError: there is none.
+        TsbenchError: no task has that name.
     """
     return f"tsbench/{name}-v{tasks.make(name).version}"
 

@@ -1,4 +1,4 @@
-"""The command line: verbs, help, exit statuses, and one line for every mistake."""
+"""The command line: verbs, help, exit statuses, and an error of one line for every mistake."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """The one line that a command is refused with."""
+    """The line of the error with which a command is refused."""
     assert verbs.main(words) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -75,7 +75,7 @@ def test_list_is_the_same_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_list_shows_tasks_without_a_configuration(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whoever adds a task writes that file last."""
+    """A new task may lack its configuration file while its author writes it."""
     monkeypatch.setattr(tasks, "_factories", dict(tasks._factories))
 
     @tasks.register("stroll")

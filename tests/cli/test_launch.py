@@ -43,7 +43,7 @@ ConfigStore.instance().store(group="hydra/launcher", name="elsewhere", node=Conf
 
 
 def test_jobs_in_another_process(tmp_path: Path) -> None:
-    """All are done, with their pages; the failure of one travels back."""
+    """All jobs finish with their pages, and the error of the failed one is reported."""
     plugins = tmp_path / "plugins"
     (plugins / "hydra_plugins").mkdir(parents=True)
     (plugins / "hydra_plugins" / "elsewhere.py").write_text(PLUGIN)

@@ -20,7 +20,7 @@ from tsbench import TsbenchError
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
-# All examples of a test share a folder: each writes its file anew.
+# All examples of a test share a folder: each example overwrites the file.
 FILES = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -104,7 +104,7 @@ def test_a_file_appears_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(np, "savez_compressed", full)
     with pytest.raises(OSError, match="No space left"):
         first.save(path)
-    assert same(Plan.load(path), second)  # what was there is untouched
+    assert same(Plan.load(path), second)  # the older file is untouched
 
 
 # Damage
@@ -139,7 +139,7 @@ def test_every_truncation(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [Plan, ReferenceMotion])
 def test_flipped_bytes(tmp_path: Path, kind: type[Plan] | type[ReferenceMotion]) -> None:
-    """Either the damage is found, or it hit what carries no meaning and all is as it was."""
+    """Loading finds the damage, or the damaged bytes carry no data and the content is unchanged."""
     path = tmp_path / "file.npz"
     original = plan() if kind is Plan else reference()
     original.save(path)
@@ -187,7 +187,7 @@ def test_a_bare_array(tmp_path: Path) -> None:
 
 
 class Trap:
-    """What a pickled file would run."""
+    """An object that runs code when it is unpickled."""
 
     sprung = False
 
@@ -211,7 +211,7 @@ def test_no_code_is_run(tmp_path: Path) -> None:
 
 
 def rewritten(path: Path, **changes: Any) -> None:
-    """A plan's file with other arrays in it; None takes one out."""
+    """Writes a plan's file with some arrays replaced; None removes an array."""
     content: dict[str, Any] = {"kind": "plan"} | asdict(plan()) | changes
     with path.open("wb") as file:
         np.savez(file, **{name: value for name, value in content.items() if value is not None})
@@ -300,7 +300,7 @@ def test_an_array_that_claims_to_be_huge(tmp_path: Path) -> None:
     refused(Plan, path)
 
 
-# What they say about time
+# Times and frames
 
 
 def test_times() -> None:
@@ -311,7 +311,7 @@ def test_times() -> None:
 
 
 def test_frames() -> None:
-    """The nearest frame, however the clock has been summed up, and the last one beyond the end."""
+    """The nearest frame, despite the rounding of summed times; the last frame beyond the end."""
     motion = reference(steps=20)
     time, clock = 0.0, []
     for _ in range(25):

@@ -1,4 +1,4 @@
-"""Tasks and methods of other packages, as they are found when they are installed."""
+"""Tasks and methods of other installed packages."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Toy:
         return self.site / f"{self.package}_tasks-0.dist-info"
 
     def install(self, version: str = "1.0") -> Toy:
-        """Writes what an installed wheel leaves."""
+        """Writes the files of an installed wheel."""
         files = {
             "__init__.py": "",
             "task.py": TASK,
@@ -108,7 +108,7 @@ class Toy:
         return self
 
     def be(self, version: str) -> None:
-        """Becomes another version."""
+        """Changes the version of the installed package."""
         (self.info / "METADATA").write_text(
             f"Metadata-Version: 2.1\nName: {self.package}-tasks\nVersion: {version}\n"
         )
@@ -124,7 +124,7 @@ def toy(tmp_path: Path) -> Toy:
 
 
 def call(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Runs a command of tsbench's. See `python`."""
+    """Runs a tsbench command. See `python`."""
     return python(folder, "-m", "tsbench", *words)
 
 
@@ -141,7 +141,7 @@ def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 def listed(folder: Path) -> dict[str, Any]:
-    """What `tsbench list` tells."""
+    """The content of `tsbench list --json`."""
     (folder / "list.json").unlink(missing_ok=True)
     done = call(folder, "list", "--json", "list.json")
     assert done.returncode == 0, done.stderr
@@ -190,7 +190,7 @@ def test_the_runs_of_a_sweep(toy: Toy, tmp_path: Path) -> None:
 
 
 def test_another_plugin_does_not_go_on_with_a_run(toy: Toy, tmp_path: Path) -> None:
-    """Another version of it, or other code under the same version."""
+    """A run is not resumed with another version of its plug-in, nor with other code."""
     done = call(tmp_path, *QUICK, "directory=run")
     assert done.returncode == 0, done.stderr
     (tmp_path / "run" / "score.json").unlink()  # as if it had been interrupted at its very end
@@ -208,7 +208,8 @@ def test_another_plugin_does_not_go_on_with_a_run(toy: Toy, tmp_path: Path) -> N
 
 
 def test_the_code_of_a_plugin(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Is all that it brings, under whatever name; what Python leaves there is not."""
+    """The hash covers the content and the names of all files but those that Python itself
+    writes."""
     monkeypatch.syspath_prepend(str(toy.site))
     try:
         provider = plugins.Provider("toy", "toy-tasks", "1.0")
@@ -224,6 +225,15 @@ def test_the_code_of_a_plugin(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None
         assert provider.code() == codes[-1]
     finally:
         sys.modules.pop("toy", None)
+
+
+@pytest.mark.parametrize("part", ["task/toy_flight", "method/lazy"])
+def test_a_missing_configuration(part: str, toy: Toy, tmp_path: Path) -> None:
+    (toy.folder / "conf" / f"{part}.yaml").unlink()
+    done = call(tmp_path, *RUN)
+    kind, name = part.split("/")
+    line = f"tsbench: the {kind} {name!r} cannot be run: its package lacks conf/{part}.yaml\n"
+    assert (done.returncode, done.stderr) == (2, line)
 
 
 @pytest.mark.parametrize("file", ["__init__.py", "task.py"])

@@ -70,7 +70,7 @@ def test_forward_by_hand() -> None:
 
 
 def actor(layers: tuple[int, ...], activation: str, seed: int) -> MLPModel:
-    """rsl-rl's own actor, with a normaliser that has seen something."""
+    """rsl-rl's own actor, with a normaliser that has been updated from observations."""
     torch.manual_seed(seed)
     observation = TensorDict({"policy": torch.zeros(1, layers[0])}, batch_size=[1])
     model = MLPModel(
@@ -146,7 +146,7 @@ def test_round_trip(tmp_path: Path, layers: tuple[int, ...]) -> None:
     observation = np.random.default_rng(0).normal(size=(9, layers[0]))
     assert loaded(observation).tobytes() == original(observation).tobytes()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["policy.json", "policy.safetensors"]
-    # Saved once more, the files are the same.
+    # Saving again gives the same files.
     before = [file.read_bytes() for file in sorted(tmp_path.iterdir())]
     loaded.save(tmp_path)
     assert [file.read_bytes() for file in sorted(tmp_path.iterdir())] == before
@@ -267,7 +267,7 @@ def test_a_description_with_a_part_missing(saved: Path) -> None:
 
 
 def rewrite(directory: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
-    """Other weights, with a description that vouches for them."""
+    """Replaces the weights, and updates the hash in the description."""
     path = directory / "policy.safetensors"
     tensors = load(path.read_bytes())
     change(tensors)

@@ -1,4 +1,4 @@
-"""The methods, end to end with tiny budgets: what they leave can be read back and scored."""
+"""The methods, end to end with tiny budgets: their results can be read back and scored."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_twostage(name: str, tmp_path: Path) -> None:
     reference = ReferenceMotion.load(tmp_path / "reference.npz")
     assert reference.duration <= plan.times[-1] + 1e-9
     assert Imitation(task, reference).horizon >= 1
-    # The audit is told, item by item, in plain words.
+    # Each failed item of the audit is shown to the user.
     audit = task.audit(plan, reference)
     if audit.passed:
         assert desk.notes == ["plan audit: passed"]
@@ -84,7 +84,7 @@ def test_twostage(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", tasks.names())
 def test_monolithic(name: str, tmp_path: Path) -> None:
-    """It has the budget of all stages together and leaves nothing but a policy."""
+    """The method uses the budget of all stages together and returns only a policy."""
     desk, given = Desk(tmp_path), problem(name)
     policy = methods.find("monolithic").train(given, desk)
     assert desk.stages == [("train", 320)]
@@ -125,7 +125,7 @@ def test_the_papers_imitation_reward(tmp_path: Path) -> None:
 
 
 def test_the_plan_is_one_deterministic_episode() -> None:
-    """Of a policy that always flies up and to the left, out of the world."""
+    """The plan of a policy that always flies up and to the left, out of the world."""
     task = tasks.make("rocket_navigation")
     planning = Planning(task)
 
@@ -135,7 +135,7 @@ def test_the_plan_is_one_deterministic_episode() -> None:
 
     info = PolicyInfo(task.name, task.version, "", "", "elu", (7, 3))
     plan = twostage.extract(planning, Always(info, np.zeros(7), np.ones(7), (), ()))
-    # Left at 0.25 m per step: -10 m after 40 steps, and out of the world with the 41st.
+    # 0.25 m to the left per step: -10 m after 40 steps, and out of the world in the 41st.
     assert plan.states.shape == (42, 3)
     assert plan.rewards.shape == (41,)
     np.testing.assert_allclose(plan.states[:, 0], -0.25 * np.arange(42))
@@ -161,7 +161,7 @@ def test_options_that_make_no_sense(
 
 
 def test_stages_of_another_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A method brings its own kinds of stages; those of no method are refused."""
+    """A method can have its own kinds of stages; kinds of no method are refused."""
     distilled = ModuleType("distilled")
     vars(distilled).update(Options=Nothing, train=lambda *_: None, STAGES=("distill",))
     monkeypatch.setitem(sys.modules, "distilled", distilled)

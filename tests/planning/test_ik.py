@@ -53,13 +53,13 @@ def angles(feet: np.ndarray) -> np.ndarray:
 
 
 def random_joints(rng: np.random.Generator) -> np.ndarray:
-    """Anywhere that a walking leg could be."""
+    """Joint angles (12) that a walking robot can have."""
     low, high = np.tile([-0.4, 0.0, -2.3], 4), np.tile([0.4, 1.4, -0.75], 4)
     return rng.uniform(low, high)
 
 
 def placed(joints: np.ndarray) -> np.ndarray:
-    """Foot centres in the world by the compiled model."""
+    """Foot centres (4, 3) in the world frame by the compiled model."""
     data = mujoco.MjData(MODEL)
     data.qpos[:] = [*BASE, *joints]
     mujoco.mj_kinematics(MODEL, data)
@@ -75,7 +75,7 @@ def test_the_closed_form_is_the_models() -> None:
 
 
 def test_reachable_targets_are_met() -> None:
-    """One after another, each from where the last one left the legs."""
+    """Targets one after another; each solution starts from the last."""
     poses = solver()
     rng = np.random.default_rng(1)
     for _ in range(60):
@@ -100,7 +100,7 @@ def test_standing_under_the_hips(height: float) -> None:
 
 
 def test_a_base_that_is_turned() -> None:
-    """Base orientation is kept, and targets are the world's."""
+    """The base orientation is kept, and targets are in the world frame."""
     turn = 0.2
     base = np.array([1.0, 2.0, 0.42, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)])
     joints = np.tile([0.1, 0.7, -1.4], 4)
@@ -128,7 +128,7 @@ def test_a_base_that_is_turned() -> None:
     ],
 )
 def test_out_of_reach(offset: tuple[float, float, float], least: float) -> None:
-    """No exception: limits hold, the base stays, and the residual says how far off a foot is."""
+    """No exception: limits hold, the base is fixed, and the residual is the largest foot error."""
     poses = solver()
     standing = placed(HOME[7:])
     for _ in range(3):

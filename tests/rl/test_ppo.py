@@ -1,4 +1,4 @@
-"""The learner: the same bits under a seed, steps counted, and something learned."""
+"""The learner: reproducible bits under a seed, counted steps, and learning progress."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_same_bits_under_a_seed(
 
 
 def test_steps_are_counted() -> None:
-    """In whole iterations of 8 environments x 16 steps."""
+    """Learning runs in whole iterations of 8 environments x 16 steps."""
     taught = learner()
     reports: list[tuple[int, Mapping[str, float]]] = []
     taught.learn(129, lambda steps, metrics: reports.append((steps, dict(metrics))))
@@ -97,7 +97,7 @@ def test_steps_are_counted() -> None:
 
 @pytest.mark.parametrize("update", ["numpy", "rsl_rl"])
 def test_rate_and_spread_fall_over_a_stage(update: str) -> None:
-    """By equal factors: four iterations of 128 steps take 1e-3 to 1e-5 in steps of 10^0.5."""
+    """Both fall by equal factors: in four iterations the rate falls from 1e-3 to 1e-5."""
     settings = replace(
         TINY,
         desired_kl=None,
@@ -151,7 +151,7 @@ def test_planning_is_one_course_of_learning(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_weights_that_blow_up_are_noticed_at_once() -> None:
-    """Before the next action is drawn from them, and with what there is to look at."""
+    """The error comes before the next action is drawn, and it holds the arrays."""
     taught = learner(replace(TINY, desired_kl=None, learning_rate=1e20))
     with pytest.raises(NotFiniteError, match="in the iteration after 0 steps") as caught:
         taught.learn(512)
@@ -170,7 +170,8 @@ def mean_return(subject: Planning[Any], policy: Policy) -> float:
 
 
 def test_it_learns_to_fly_to_a_goal() -> None:
-    """3 m away: nearly as good as straight there, from nearly as bad as standing still."""
+    """The goal is 3 m away. The return rises from about that of standing still to nearly the
+    best."""
     subject = planning()
     chosen = PPOSettings(
         environments=64, rollout=15, hidden=(32,), discount=0.95, learning_rate=3e-3,
@@ -199,7 +200,7 @@ def test_the_first_actions_are_the_nominal_pose() -> None:
 
 
 def test_going_on_with_another_reward() -> None:
-    """The actor and both normalisers are taken over; the critic and the noise start anew."""
+    """The actor and both normalisers are copied; critic weights and noise are new."""
     first = learner(subject=tasks.make("rocket_navigation", distance=3.0))
     first.learn(512)
     second = learner(
@@ -233,7 +234,7 @@ def test_the_artefact_is_the_actor(encoding: str) -> None:
 
 
 def test_what_rsl_rl_sees() -> None:
-    """Float32 tensors, time-outs told from endings, nothing shared between steps."""
+    """Tensors are float32, time-outs differ from terminal states, and steps share no memory."""
     subject = planning()
     environment = TorchEnvironment(BatchedEnvironment(subject, subject, 2, 0))
     first = environment.get_observations()
@@ -242,7 +243,7 @@ def test_what_rsl_rl_sees() -> None:
     assert first["policy"].shape == (2, 7)
     assert first["policy"].dtype == torch.float32
     kept = first["policy"].clone()
-    # One stands, one leaves the world: it is at -10 m after 40 steps, so move the border there.
+    # The first rocket stands. The second starts 1.4 m from the border and leaves in the sixth step.
     actions = torch.tensor([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     environment.environment.state = environment.environment.state.replace(
         position=np.array([[0.0, 0.0], [-8.6, 0.0]])
@@ -253,14 +254,14 @@ def test_what_rsl_rl_sees() -> None:
         assert observation["value"].shape[0] == 2
         assert done.tolist() == [int(step == 15), int(step == 6)]
         assert extras["time_outs"].tolist() == [float(step == 15), 0.0]
-        # From there the second one has nine steps of its own, at 0.25 m each.
+        # The next episode of the second one has nine steps, of 0.25 m each.
     assert torch.equal(first["policy"], kept)
     assert environment.episode_length_buf.tolist() == [0, 9]
 
 
 def test_held_actions() -> None:
-    """Three steps an action. One episode leaves the world in the second step of a hold; what begins
-    then stands still for the third, unrewarded. Another has its last step in the first."""
+    """Three steps an action. One episode leaves the world in the second step of an action. The next
+    one stands still in the third step, without reward. Another ends with the first step."""
     subject = planning()
     plain, held = (BatchedEnvironment(subject, subject, 2, 0) for _ in range(2))
     stepped, environment = TorchEnvironment(plain), TorchEnvironment(held, repeat=3)
@@ -284,7 +285,7 @@ def test_held_actions() -> None:
 
 
 def test_held_actions_are_counted_as_steps() -> None:
-    """8 environments x 16 actions x 3 steps; the discount is one step's."""
+    """An iteration has 8 environments x 16 actions x 3 steps; the discount is per step."""
     taught = learner(replace(TINY, repeat=3, discount=0.9))
     reports: list[tuple[int, Mapping[str, float]]] = []
     taught.learn(385, lambda steps, metrics: reports.append((steps, dict(metrics))))
@@ -367,7 +368,7 @@ def test_settings() -> None:
     for asked, given in ((999, 16), (8, 8), (None, 16)):
         plan = {} if asked is None else {"environments": asked}
         assert settings(problem(16, plan=plan), "plan").environments == given
-    # The last stage goes on with the imitation's network.
+    # Fine-tuning continues with the network of the imitation stage.
     both = problem(imitate={"hidden": [8], "entropy": 0.1}, finetune={"entropy": 0.2})
     assert settings(both, "finetune") == StageSettings(hidden=(8,), entropy=0.2)
 

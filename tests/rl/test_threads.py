@@ -1,4 +1,4 @@
-"""Threads: one while networks learn, and whatever the process had otherwise."""
+"""Threads: one while networks learn, and the former number afterwards."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ print(*threads())
 
 
 def test_networks_learn_on_one_thread() -> None:
-    """An import changes nothing; a learner is made and learns on one thread and then gives the
-    process its own number back."""
+    """An import changes no limit. A learner is made and trained on one thread; then the former
+    limits are restored."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["3 2", "1 1", "3 2", "1 1", "3 2"]

@@ -1,4 +1,4 @@
-"""Collecting steps and learning from them, against rsl-rl's PPO; the two updates, against each
+"""The rollout and the update, compared with rsl-rl's PPO; the two updates, compared with each
 other."""
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SMALL = PPOSettings(
 
 
 class Subject:
-    """Networks and their steps; of one seed, always the same."""
+    """Networks and a rollout storage, reproducible from the seed."""
 
     def __init__(self, settings: PPOSettings = SMALL, seed: int = 0) -> None:
         torch.manual_seed(seed)
@@ -56,7 +56,7 @@ class Subject:
         )  # fmt: skip
 
     def collect(self, seed: int) -> None:
-        """Steps enough for one update."""
+        """Collects enough steps for one update."""
         rollout = self.rollout
         fill(
             rollout.act,
@@ -80,7 +80,7 @@ def fill(
     seed: int,
     time_outs: bool = False,
 ) -> None:
-    """Random steps, of one seed always the same."""
+    """Fills a storage with random steps, reproducible from the seed."""
     torch.manual_seed(seed)
     with torch.inference_mode():
         for _ in range(STEPS):
@@ -97,7 +97,7 @@ def fill(
 @pytest.mark.parametrize("time_outs", [False, True])
 @pytest.mark.parametrize("normalise", [False, True])
 def test_steps_are_collected_as_by_rsl_rl(time_outs: bool, normalise: bool) -> None:
-    """To the last bit."""
+    """The stored tensors are equal to the last bit."""
     settings = replace(SMALL, minibatch_advantages=not normalise)
     ours, theirs = Subject(settings), Subject(settings)
     ppo = PPO(
@@ -136,8 +136,8 @@ def test_steps_are_collected_as_by_rsl_rl(time_outs: bool, normalise: bool) -> N
     ids=str,
 )
 def test_both_updates_are_the_same(changes: dict[str, Any]) -> None:
-    """Two updates of twelve steps: the same weights, losses, rate and normalisers but for rounding,
-    which is a thousandth of how far the weights come."""
+    """Two updates of twelve gradient steps: weights, losses, rate and normalisers are equal within
+    a thousandth of the distance that the weights move."""
     settings = replace(SMALL, **changes)
     subjects = [Subject(settings) for _ in range(2)]
     ours, theirs = updates = tuple(
@@ -164,7 +164,7 @@ def test_both_updates_are_the_same(changes: dict[str, Any]) -> None:
 
 
 def test_rsl_rls_update_is_its_ppo() -> None:
-    """With every setting passed on, to the last bit."""
+    """The results are equal to the last bit, with every setting passed on."""
     settings = replace(
         SMALL, epochs=2, minibatches=3, clip=0.1, clip_value=True, entropy=0.2, learning_rate=2e-3,
         desired_kl=0.003, value_weight=0.7, gradient_norm=0.3, optimizer="adamw",
@@ -190,9 +190,9 @@ def test_rsl_rls_update_is_its_ppo() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_whole_trainings_are_the_same(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five iterations in which rate and spread fall: the same weights but for rounding, which is a
-    thousandth of how far they come. rsl-rl's update draws actions that it has no use for, so both
-    get the same noise for the next iteration."""
+    """Five iterations in which rate and standard deviation fall: weights are equal within a
+    thousandth of the distance that they move. rsl-rl's update draws actions without using them, so
+    the generator is seeded again after each update."""
     settings = replace(
         SMALL, learning_rate=3e-4, final_learning_rate=1e-4, initial_std=0.8, final_std=0.6,
         clip_value=True, entropy=0.01,
@@ -232,7 +232,8 @@ def test_whole_trainings_are_the_same(seed: int, monkeypatch: pytest.MonkeyPatch
     ids=str,
 )
 def test_an_update_goes_on_from_a_snapshot(changes: dict[str, Any]) -> None:
-    """In one that has moments and a rate of its own, and from what came back from the disk."""
+    """A snapshot is encoded, decoded and restored into an update that has other moments and
+    rate."""
     settings = replace(SMALL, desired_kl=1e-5, **changes)
     subjects = [Subject(settings, seed) for seed in (0, 5)]
     updates = [make_update(s.actor, s.critic, s.storage, settings) for s in subjects]

@@ -1,4 +1,4 @@
-"""Checkpoints: nothing is lost on the way to the disk and back, and damage is noticed."""
+"""Checkpoints: a snapshot survives saving and loading unchanged, and damage is detected."""
 
 from __future__ import annotations
 

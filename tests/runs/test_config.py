@@ -1,4 +1,4 @@
-"""Words to configurations: what is accepted, and what each mistake is told."""
+"""Configurations from words: the accepted words, and the error for each mistake."""
 
 from __future__ import annotations
 

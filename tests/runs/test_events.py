@@ -1,4 +1,4 @@
-"""TensorBoard's events: the metrics once more, which no run depends on."""
+"""TensorBoard's events: they repeat the metrics, and no run depends on them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_rows_of_before_and_of_now(known: int, tmp_path: Path) -> None:
         for stage in ("plan", "imitate")
         for name in ("loss", "std")
     }
-    assert read(folder) == expected  # already: they are looked at while it runs
+    assert read(folder) == expected  # before `close`: users look at them while the run trains
     events.close()
     assert read(folder) == expected
     assert len(list(folder.iterdir())) == 2
@@ -70,7 +70,7 @@ def test_a_number_beyond_float32(tmp_path: Path) -> None:
 
 
 def test_a_run_goes_on_without_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Once the folder has gone: told in one line, and nothing of TensorBoard's thread is shown."""
+    """After its folder is removed, a run says so in one line and shows no error of a thread."""
     folder, told, hook = tmp_path / "tensorboard", list[str](), threading.excepthook
     events = Events(folder, written(tmp_path / "metrics.jsonl", ROWS[:1]), told.append)
     shutil.rmtree(folder)

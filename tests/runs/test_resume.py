@@ -57,7 +57,7 @@ PAGES = {"learning_curves.png", "view.html", "report.html"}
 
 
 class Crash(BaseException):
-    """What nothing in the program catches, as nothing catches kill -9."""
+    """An exception that the program never catches, as it cannot catch kill -9."""
 
 
 def begin(directory: Path) -> None:
@@ -71,9 +71,9 @@ def resume(directory: Path) -> None:
 
 @pytest.fixture
 def crash(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, bool], None]:
-    """Makes the run stop dead in that iteration from now on, before or after its checkpoint."""
+    """A function that lets a run crash in a given iteration, before or after its checkpoint."""
     update, keep = RunMonitor.update, RunWorkspace.keep
-    left: list[Any] = [-1, True]  # iterations, and whether to die before the checkpoint
+    left: list[Any] = [-1, True]  # iterations left, and whether to crash before the checkpoint
 
     def counted(self: RunMonitor, *arguments: Any) -> None:
         left[0] -= 1
@@ -95,8 +95,7 @@ def crash(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, bool], None]:
 
 
 def result(directory: Path) -> dict[str, Any]:
-    """All that a run leaves, but for how long things took, and for the pages that the command line
-    makes of it."""
+    """A run's results, without times and without the pages of the command line."""
     rows = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
     content = RunDirectory(directory).record()
     recordings = [dict(np.load(directory / f"{name}.npz")) for name in ("plan", "reference")]
@@ -129,7 +128,7 @@ def result(directory: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run. Not to be changed."""
+    """A finished run, which no test may change."""
     directory = tmp_path_factory.mktemp("runs") / "whole"
     begin(directory)
     return directory
@@ -137,7 +136,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that stopped dead in the middle of its second stage. Not to be changed."""
+    """A run that crashed in the middle of its second stage, which no test may change."""
     directory = tmp_path_factory.mktemp("runs") / "broken"
     with pytest.MonkeyPatch.context() as monkeypatch:
         keep = RunWorkspace.keep
@@ -155,7 +154,7 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def unfinished(broken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """That run to play with, below the current directory."""
+    """A copy of the broken run below the current directory, which tests may change."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(broken, "run")
     return Path("run")
@@ -165,7 +164,7 @@ def unfinished(broken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_the_same_bits_after_a_crash_in_every_iteration(
     unsaved: bool, uninterrupted: Path, tmp_path: Path, crash: Callable[[int, bool], None]
 ) -> None:
-    """Each process saves one iteration and dies, then or in the next one before its checkpoint."""
+    """Each process saves one iteration, and crashes then or in the next before its checkpoint."""
     directory = tmp_path / "run"
     deaths = 0
     go_on: Callable[[Path], None] = begin
@@ -196,7 +195,7 @@ def test_the_learner_goes_on_to_the_last_bit(
     update: str,
     naive_reference: Callable[[str], ReferenceMotion],
 ) -> None:
-    """On every kind of stage, from what came back from the disk, in a fresh one of another seed."""
+    """In every kind of stage, a new learner of another seed continues from the loaded snapshot."""
     trot, rocket = tasks.make("laikago_trot"), tasks.make("rocket_obstacles")
     subjects: dict[str, Any] = {
         "kinematics": Planning(rocket, explore=0.5),
@@ -215,7 +214,7 @@ def test_the_learner_goes_on_to_the_last_bit(
 
     def learner(name: str, seed: int) -> Learner:
         subject = dynamics = subjects[name]
-        if name == "disturbances":  # which physics there are is part of the problem
+        if name == "disturbances":  # the variations of the physics belong to the problem
             dynamics = DisturbedPhysics(subject, chosen.environments, disturb, 0, threads=1)
         elif not isinstance(subject, Planning):
             dynamics = Physics(subject, chosen.environments, threads=1)
@@ -239,7 +238,7 @@ def test_the_learner_goes_on_to_the_last_bit(
 def test_a_torn_checkpoint_is_told_and_the_one_before_is_used(
     unfinished: Path, uninterrupted: Path
 ) -> None:
-    """Even the last one of a stage that was finished."""
+    """This holds for the last checkpoint of a finished stage too."""
     for stage in ("00", "01"):
         newest = sorted((unfinished / "checkpoints").glob(f"{stage}-*"))[-1]
         newest.write_bytes(newest.read_bytes()[:-100])
@@ -354,7 +353,7 @@ def test_a_finished_run_is_not_resumed(
 
 
 def test_two_at_once_in_a_directory(unfinished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The second is refused; when the first has been killed, the lock is gone."""
+    """The second process is refused; the lock is free once the first has been killed."""
     program = (
         "import sys, time; from pathlib import Path; from tsbench.runs import execute\n"
         "with execute._locked(Path('run')): print('locked', flush=True); time.sleep(60)"
@@ -382,7 +381,7 @@ def test_a_signal_saves_the_iteration_and_says_how_to_go_on(
     number: signal.Signals, status: int, uninterrupted: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """In the middle of the fifth iteration, with no other checkpoint due."""
+    """The signal arrives in the middle of the fifth iteration, with no other checkpoint due."""
     monkeypatch.chdir(tmp_path)
     words = [*WORDS[:-1], "checkpoint=1000"]
     step, steps = BatchedEnvironment.step, [0]
@@ -424,7 +423,7 @@ def test_between_iterations_a_signal_stops_at_once(tmp_path: Path) -> None:
 
 
 def test_a_stage_without_snapshots_is_done_again(tmp_path: Path) -> None:
-    """What it reports is not counted twice, and the stages around it keep what they have."""
+    """Its reports are not counted twice, and the other stages keep theirs."""
 
     names = ("roadmap", "train", "smooth", "polish")
 
@@ -459,5 +458,5 @@ def test_a_stage_without_snapshots_is_done_again(tmp_path: Path) -> None:
 
 
 def test_the_policy_can_be_read_back(uninterrupted: Path) -> None:
-    """So that equal bytes above mean an equal policy."""
+    """Equal bytes in the tests above therefore mean equal policies."""
     assert Policy.load(uninterrupted).info.task == "rocket_navigation"

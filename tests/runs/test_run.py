@@ -1,4 +1,4 @@
-"""One run, end to end: what its directory holds, and that it can be trusted later."""
+"""One run, end to end: the content of its directory, and checks of it later."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512"
 
 
 def plain(content: Any) -> Any:
-    """As it is read back from a file."""
+    """The content as JSON gives it back."""
     return json.loads(json.dumps(content))
 
 
 def execute(directory: Path, words: list[str] = WORDS) -> str:
-    """Makes a run with its pages and returns what it showed."""
+    """Makes a run with its pages and returns its output."""
     chosen = replace(config.compose(words), directory=str(directory))
     with (directory.parent / "out").open("w+") as file:
         console = Console(file=file, width=100)
@@ -58,14 +58,14 @@ def execute(directory: Path, words: list[str] = WORDS) -> str:
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A finished run's directory, and what was shown meanwhile. Not to be changed."""
+    """A finished run's directory, which no test may change, and the run's output."""
     directory = tmp_path_factory.mktemp("runs") / "one"
     return directory, execute(directory)
 
 
 @pytest.fixture
 def finished(shown: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A finished run to play with, below the current directory."""
+    """A copy of the finished run below the current directory, which tests may change."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(shown[0], "one")
     return Path("one")
@@ -274,7 +274,7 @@ def test_evaluate_replays_where_the_machine_differs(
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> str:
-    """A protocol whose scores can be ranked, in seconds."""
+    """A protocol that takes seconds, and whose scores can be ranked."""
     monkeypatch.setitem(PROTOCOLS, "quick", replace(SMOKE, name="quick", ranked=True))
     return "quick"
 
@@ -313,7 +313,7 @@ def test_a_kept_run_is_an_entry(
 def test_a_run_of_any_method_can_be_kept(
     quick: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without a plan, as one that learns to act directly, and with its pages made of the entry."""
+    """A method without a plan gives an entry, and the pages can be made from that entry."""
     monkeypatch.chdir(tmp_path)
     words = ["task=rocket_navigation", "method=monolithic", "budget=smoke"]
     assert cli.main(["run", *words, "task.budgets.smoke.act=512", "directory=one"]) == 0
@@ -332,7 +332,7 @@ def test_a_run_of_any_method_can_be_kept(
 
 
 def test_a_score_by_another_seed_is_no_entry(finished: Path, quick: str) -> None:
-    """Its protocol calls itself by the same name, and says that it is ranked."""
+    """The changed protocol has the same name and says that it is ranked."""
     run = RunDirectory(finished)
     score = run.record().score
     for other in (replace(PROTOCOLS[quick], seed=1), replace(PROTOCOLS[quick], perturbed=9)):
@@ -370,15 +370,21 @@ def plan_of_another_task(run: Path) -> None:
     [
         (lambda run: (run / "reference.npz").write_bytes(b"PK"), "damaged"),
         (plan_of_another_task, "rocket_obstacles"),
-        (lambda run: other_score(run, "task", value="laikago_trot"), "not of one task"),
-        (lambda run: other_score(run, "method", value="mine"), "not of one method"),
-        (lambda run: other_config(run, "name: twostage", "name: monolithic"), "not of one method"),
-        (lambda run: other_score(run, "task_version", value=7), "not of one version of the task"),
-        (lambda run: other_config(run, "seed: 3", "seed: 4"), "not of one seed"),
-        (lambda run: other_score(run, "budget", value="fast"), "not of one budget"),
+        (lambda run: other_score(run, "task", value="laikago_trot"), "disagree on the task"),
+        (lambda run: other_score(run, "method", value="mine"), "disagree on the method"),
+        (
+            lambda run: other_config(run, "name: twostage", "name: monolithic"),
+            "disagree on the method",
+        ),
+        (
+            lambda run: other_score(run, "task_version", value=7),
+            "disagree on the version of the task",
+        ),
+        (lambda run: other_config(run, "seed: 3", "seed: 4"), "disagree on the seed"),
+        (lambda run: other_score(run, "budget", value="fast"), "disagree on the budget"),
         (
             lambda run: other_score(run, "score", "origin", "policy", value="0" * 64),
-            "one mixes several runs: its files are not of one policy",
+            "one mixes several runs: its files disagree on the policy",
         ),
         (lambda run: other_score(run, "standard", value=False), "changed constants"),
         (lambda run: (run / "versions.json").write_text("hi"), "damaged versions"),
@@ -404,7 +410,7 @@ def test_a_score_that_does_not_repeat_is_no_entry(
     other_score(Path("good"), "score", "nominal", "normalized_reward", value=0.99)
     words = ["evaluate", "good", "--keep", "bad", "--json", "figures.json"]
     assert cli.main(words) == 1
-    assert "not kept: the score is not what it was" in capsys.readouterr().out
+    assert "not kept: the score differs from the recorded one" in capsys.readouterr().out
     assert not Path("bad").exists()
     assert json.loads(Path("figures.json").read_text())["comparison"]["agrees"] is False
 
@@ -521,7 +527,7 @@ def test_a_policy_is_refused_where_it_does_not_belong(
 
 @pytest.mark.parametrize("size", [600, 30_000, 300_000])
 def test_a_full_disk_stops_a_run_in_one_line(size: int, tmp_path: Path) -> None:
-    """No file may grow beyond `size` bytes: the system's refusal at different places of a run."""
+    """No file may exceed `size` bytes: the system refuses a write at some point of the run."""
     program = (
         "import resource, sys\n"
         "from tsbench.cli import main\n"
@@ -537,7 +543,7 @@ def test_a_full_disk_stops_a_run_in_one_line(size: int, tmp_path: Path) -> None:
     assert "File too large" in done.stderr
     assert done.stderr.count("\n") == 1
     run = RunDirectory(tmp_path / "mine")
-    assert run.finished == (size == 300_000)  # then only the pages are too large
+    assert run.finished == (size == 300_000)  # with this size only the pages are too large
     if run.finished:
         assert done.stderr.endswith("its pages are not: tsbench report mine\n")
         assert not run.report_file.exists()
@@ -568,7 +574,7 @@ def test_a_run_that_fails_later_keeps_what_it_has(
     assert not (tmp_path / "mine" / "score.json").exists()
 
 
-# So near that an episode takes a second and a half.
+# A goal so near that an episode takes 1.5 s.
 SHORT = [
     *WORDS[:3],
     "task.budgets.smoke.act=512",
@@ -584,7 +590,7 @@ PAGES = {"learning_curves.png", "view.html", "report.html"}
 def test_pages_that_a_finished_run_lacks_are_made(
     words: list[str], finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """From its directory alone; what is there stays."""
+    """They are made from the run's directory alone, and existing pages stay."""
     before = {name: (finished / name).read_bytes() for name in PAGES}
     for name in PAGES - {"view.html"}:
         (finished / name).unlink()
@@ -632,7 +638,8 @@ def test_changed_constants_are_recorded(tmp_path: Path) -> None:
 def test_a_sweep_goes_on_after_failures_and_lists_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One directory is taken, one run meets a bug; when it is mended, only that is done."""
+    """One directory is taken and one run meets a bug. After the bug is fixed, the sweep does only
+    that run."""
     monkeypatch.chdir(tmp_path)
     words = ["run", "-m", *SHORT, "seed=0,1,2"]
     places = [

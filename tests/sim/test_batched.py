@@ -39,7 +39,7 @@ def test_equal_through_a_collision() -> None:
 
 @pytest.mark.parametrize("name", tasks.names())
 def test_rows_do_not_know_each_other(name: str) -> None:
-    """The same for any number of threads, any batch around a row, and any order of rows."""
+    """A row is equal for any number of threads, any other rows, and any order of rows."""
     task = tasks.make(name)
     rng = np.random.default_rng(0)
     starts = task.start(rng, 7, perturbed=True)
@@ -62,12 +62,12 @@ def test_rows_do_not_know_each_other(name: str) -> None:
 @pytest.mark.parametrize("name", plannable_tasks())
 @pytest.mark.parametrize("variant", [None, "planning"])
 def test_episodes_begin_anew(name: str, variant: tsbench.Variant | None) -> None:
-    """Several episodes on end: each is what a fresh environment would give."""
+    """Several episodes in a row: each equals that of a new environment."""
     batch = tsbench.load_batched(name, variant, count=2, threads=1)
     steps = batch.mdp.horizon + 50  # at least one whole episode of each
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1.0, 1.0, (steps, 2, batch.mdp.action_size))
-    actions[30:, 0] = 0.0  # to one something else happens
+    actions[30:, 0] = 0.0  # one row idles from here on
     observations, transitions = [batch.reset()], []
     for action in actions:
         transitions.append(batch.step(action))
@@ -136,7 +136,7 @@ def test_truncation_and_termination() -> None:
         assert transition.terminal.tolist() == [step == 41, False]
         assert not transition.truncated.any()
         assert batch.steps.tolist() == [step % 41, step]
-    batch.steps[:] = planning.horizon - 1  # as if all this had taken longer
+    batch.steps[:] = planning.horizon - 1  # at the last step
     batch.state = batch.state.replace(position=np.array([[0.0, -10.0], [0.0, 0.0]]))
     transition = batch.step(action)
     assert transition.terminal.tolist() == [True, False]
@@ -176,7 +176,7 @@ def test_steps_count_from_where_the_reference_is(
     assert last.any()
     transition = batch.step(np.zeros((200, 12)))
     np.testing.assert_array_equal(transition.truncated, last & ~transition.terminal)
-    for _ in range(5):  # and again where a new episode has begun
+    for _ in range(5):  # and again in a new episode
         batch.step(np.zeros((200, 12)))
         np.testing.assert_allclose(batch.state.time, batch.steps / 30)
     assert np.any(batch.steps[last] > 6)

@@ -1,4 +1,4 @@
-"""Random worlds to train in: what they do, and that they repeat."""
+"""Disturbances of training: their effects and their reproducibility."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMES = one_of_each_kind()
 def states(
     name: str, disturbances: Disturbances, *, seed: int = 0, threads: int = 1, steps: int = 60
 ) -> list[Any]:
-    """What four environments go through under random actions."""
+    """The states of four environments under random actions."""
     task = tasks.make(name)
     physics: Physics[Any] = DisturbedPhysics(task, 4, disturbances, seed, threads=threads)
     batch = BatchedEnvironment(task, physics, 4, seed)
@@ -48,7 +48,7 @@ EVERYTHING = Disturbances(push=200.0, interval=0.5, mass=0.2, friction=0.5, stre
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_seed_is_everything(name: str) -> None:
-    """The same world at any number of threads, another one with another seed."""
+    """Disturbances are equal for any number of threads and differ between seeds."""
     first = states(name, EVERYTHING)
     again = states(name, EVERYTHING, threads=2)
     assert all(same(*pair) for pair in zip(first, again, strict=True))
@@ -57,8 +57,8 @@ def test_the_seed_is_everything(name: str) -> None:
 
 
 def test_pushes_come_once_an_interval() -> None:
-    """Idle rockets: each is pushed for 0.1 s in every 0.5 s, from a time of its own on, every time
-    another way, by at most 20 N."""
+    """Idle rockets: each is pushed for 0.1 s in every 0.5 s, from a random time on, by at most 20
+    N, each time in another direction."""
     task = tasks.make("rocket_navigation")
     count, steps = 40, 125  # 2.5 s
     disturbances = Disturbances(push=20.0, interval=0.5)
@@ -86,7 +86,7 @@ def test_pushes_come_once_an_interval() -> None:
 
 
 def test_pushes_grow_over_the_first_steps() -> None:
-    """Those of an episode that begins after a quarter of them are bounded by a quarter."""
+    """After a quarter of the steps of `rise`, pushes have at most a quarter of the full force."""
     task = tasks.make("rocket_navigation")
     physics = DisturbedPhysics(task, 50, Disturbances(push=20.0, rise=4000), 0, threads=1)
     rows, rng = np.arange(50), np.random.default_rng(0)
@@ -105,7 +105,7 @@ def test_pushes_grow_over_the_first_steps() -> None:
 
 
 def test_some_episodes_are_calm() -> None:
-    """Three tenths of them meet no push at all, and those change from episode to episode."""
+    """Three tenths of the rows get no push at all; other rows in each episode."""
     task = tasks.make("rocket_navigation")
     disturbances = Disturbances(push=20.0, calm=0.3, interval=0.5)
     physics = DisturbedPhysics(task, 1000, disturbances, 0, threads=1)

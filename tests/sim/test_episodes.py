@@ -22,8 +22,8 @@ class Line(State):
 
     Attributes:
         x: metres, shape (...,).
-        speed: metres that its policy wants a step to have, shape (...,).
-        hurt: whether it happened on this step, shape (...,).
+        speed: metres per step that the policy asks for, shape (...,).
+        hurt: whether this step is a violation, shape (...,).
     """
 
     x: Array
@@ -32,7 +32,8 @@ class Line(State):
 
 
 class Walk(MDP[Line]):
-    """Reward: the distance walked. The goal is x = 4, the cliff x = -3; 7 hurts; 5 is both."""
+    """The reward is the distance walked. Goals are x = 4 and 5, violations x = 5 and 7; x = -3 is a
+    cliff, which ends the episode."""
 
     name, version, horizon, timestep = "walk", 1, HORIZON, 0.5
     observation_size, action_size, max_reward = 3, 1, 2.0
@@ -109,7 +110,7 @@ def test_one_episode(
 
 
 def test_many_side_by_side() -> None:
-    """What comes after an episode's end, and what the others do, changes nothing."""
+    """An episode's results depend neither on the steps after its end nor on other episodes."""
     starts, speeds = [0.0, 0.0, 6.0, 0.0], [1.0, -1.0, 1.0, 0.25]
     together = walk(starts, speeds, record=lambda state: state.x)
     for index, (start, speed) in enumerate(zip(starts, speeds, strict=True)):
@@ -129,8 +130,8 @@ def test_many_side_by_side() -> None:
 
 
 def test_record_after_the_last_end() -> None:
-    """Play stops when nobody is left, and whoever has ended is left alone before; the record is as
-    long as ever."""
+    """Ended episodes are not stepped, and play stops when all have ended. The record still has
+    full length."""
     mdp = Walk([0.0, 0.0], [2.0, -1.0])
     episodes = play(
         mdp, mdp, wanted, 2, record=lambda state: np.stack([state.x, state.time], axis=-1)
@@ -159,7 +160,7 @@ def test_survival(start: float, speed: float, survived: bool) -> None:
 
 
 def test_going_on_from_states() -> None:
-    """Episodes that begin late have fewer steps, each its own number; only those count."""
+    """Episodes that begin late have fewer steps, and returns are normalised by that number."""
     mdp = Walk([0.0] * 3, [0.25, 1.0, 0.25])
     begin = Line(
         np.array([4.0, 2.0, 0.0]), np.array([0.0, 0.0, 1.0]), mdp.speeds, np.zeros(3, bool)
@@ -175,7 +176,7 @@ def test_going_on_from_states() -> None:
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
 def test_late_actions(delay: int) -> None:
-    """The action of each step is the one wanted `delay` steps before, zero at first."""
+    """Each step uses the action of the observation `delay` steps before, zero at first."""
     mdp = Walk([0.0, 0.5], [0.0, 0.0])
     episodes = play(mdp, mdp, lambda observation: 0.1 + 0.01 * observation[:, :1], 2, delay=delay)
     expected = [0.0] * delay + [0.1 + 0.005 * step for step in range(HORIZON - delay)]

@@ -1,4 +1,4 @@
-"""What goes wrong in a simulation: counted, ended and told, alike for one and for many."""
+"""Failures of a simulation: counted, ended and reported, equally for one and many episodes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STILL = np.zeros((3, 12))
 
 
 class Altered:
-    """A task in which one thing is different."""
+    """A task with some attributes replaced."""
 
     def __init__(self, task: Task[Any], **changes: Any) -> None:
         self.task = task
@@ -43,7 +43,7 @@ def task() -> Task[Any]:
 
 
 def bursting(task: Task[Any], rows: list[int]) -> Any:
-    """The task, with starts of which some are too fast to be computed."""
+    """The task with starts in `rows` that are too fast to be computed."""
 
     def start(rng: np.random.Generator, count: int, *, perturbed: bool = False) -> Start:
         begun = task.start(rng, count)
@@ -93,7 +93,7 @@ def test_one_and_many_agree_on_a_diverged_episode(task: Task[Any]) -> None:
 
 
 def test_a_diverged_episode_is_scored_as_a_failure(task: Task[Any]) -> None:
-    """It is not dropped: it counts among the episodes, with what it had earned."""
+    """The episode is not dropped: it counts, with the rewards before the divergence."""
     wild = bursting(task, [1])
     episodes = play(task, Physics(wild, 3, threads=1), lambda o: np.zeros((len(o), 12)), 3, 0)
     assert episodes.diverged.tolist() == [False, True, False]
@@ -149,7 +149,7 @@ def piled(task: Task[Any], memory: int) -> Physics[Any]:
 
 
 def test_a_full_arena_is_counted_and_ends_nothing(task: Task[Any]) -> None:
-    """Contacts that do not fit are left out by mujoco: the physics is wrong, but goes on."""
+    """mujoco leaves out contacts that do not fit: the physics is wrong but continues."""
     physics = piled(task, 30_000)
     physics.advance(physics.begin(np.random.default_rng(0), np.arange(3)), STILL)
     assert physics.diverged.tolist() == []

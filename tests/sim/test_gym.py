@@ -1,4 +1,4 @@
-"""The Gymnasium environments: the floats of dm_control's and of the batched one."""
+"""The Gymnasium environments give the floats of the dm_control and batched environments."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COUNT = 3
 
 
 def actions_of(steps: int, size: int) -> np.ndarray:
-    """(steps, COUNT, size), none positive: Laikago trips, a rocket without main engine falls."""
+    """Actions (steps, COUNT, size) that are not positive: Laikago trips, and the rocket falls."""
     return np.random.default_rng(7).uniform(-1.0, 0.0, (steps, COUNT, size))
 
 
@@ -30,7 +30,7 @@ def actions_of(steps: int, size: int) -> np.ndarray:
 def test_gymnasium_finds_no_fault(name: str, perturbed: bool) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Positions and velocities have no bounds that one could name.
+        # Positions and velocities are unbounded.
         warnings.filterwarnings("ignore", message=".*A Box observation space .* value is -?inf")
         check_env(GymEnvironment(tsbench.load(name, perturbed=perturbed)), skip_render_check=True)
 
@@ -40,13 +40,13 @@ def test_gymnasium_finds_no_fault(name: str, perturbed: bool) -> None:
 def test_equal_to_the_dm_control_environment(
     name: str, variant: tsbench.Variant | None, naive_reference: Callable[[str], ReferenceMotion]
 ) -> None:
-    """To the last bit, over the ends of episodes, from the same seed."""
+    """Equal to the last bit from the same seed, also after the end of an episode."""
     reference = naive_reference(name) if variant == "imitation" else None
     single = tsbench.load(name, variant, reference=reference, seed=5)
     coated = GymEnvironment(tsbench.load(name, variant, reference=reference))
     time_step = single.reset()
     observation, info = coated.reset(seed=5)
-    steps = 40 if variant == "planning" else 250  # inverse kinematics takes its time
+    steps = 40 if variant == "planning" else 250  # inverse kinematics is slow
     size = coated.single.task.mdp.action_size
     ends = 0
     for action in actions_of(steps, size)[:, 0]:
@@ -97,7 +97,7 @@ def test_an_arrival_spares_steps() -> None:
 
 
 def test_the_last_step_truncates() -> None:
-    """1.5 times the 15 planner's steps (of 0.05 s) to a goal 3 m away are 39 of 0.02 s."""
+    """The horizon is 1.5 times the planner's flight time: 39 steps of 0.02 s to a goal 3 m away."""
     coated = GymEnvironment(tsbench.load("rocket_navigation", distance=3.0))
     coated.reset(seed=0)
     hover = np.array([[0.5, 0.0], [0.0, 0.0]])  # least thrust every other step
@@ -142,7 +142,7 @@ def test_the_vector_environment_is_the_batched_one(name: str) -> None:
 
 @pytest.mark.parametrize("name", one_of_each_kind())
 def test_the_vector_environment_is_gymnasiums_own(name: str) -> None:
-    """What SyncVectorEnv makes of single environments, final observations included."""
+    """Equal to SyncVectorEnv over single environments, final observations included."""
     own: Any = SyncVectorEnv(
         [lambda: GymEnvironment(tsbench.load(name))] * COUNT,
         autoreset_mode=AutoresetMode.SAME_STEP,

@@ -21,7 +21,7 @@ from tsbench.testing.episodes import plannable_tasks
 NAMES = plannable_tasks()
 HIPS = np.array([[0.21935, -0.1245], [0.21935, 0.1245], [-0.21935, -0.1245], [-0.21935, 0.1245]])
 SOLE = 0.0265
-REACH, DT = PLAN_REACH, PLAN_TIMESTEP  # calibrated; all else here is written out
+REACH, DT = PLAN_REACH, PLAN_TIMESTEP  # calibrated; all other numbers are written out here
 SPEED = {"laikago_walk": 0.264, "laikago_trot": 0.63}
 SWING = {"laikago_walk": 1.65 * 0.48 * DT, "laikago_trot": 1.26 * 0.50 * DT}  # m per plan step
 
@@ -261,7 +261,7 @@ def test_share_of_sampled_starts() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_batched_path_agrees_with_full_poses(name: str) -> None:
-    """The environment that one can look at gives the very same floats, and its poses are those."""
+    """The dm_control environment gives the same floats, and its full poses match the states."""
     environment = tsbench.load(name, "planning")
     planning = make(name)
     batch = BatchedEnvironment(planning, planning, 3, 0)
@@ -316,7 +316,7 @@ def test_rows_do_not_know_each_other(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_coordinates(name: str) -> None:
-    """A plan's columns are what their names say."""
+    """The columns of a plan match the names of the coordinates."""
     abstraction = make(name).abstraction
     state = abstraction.sample(np.random.default_rng(0), 5)
     flat = dict(zip(abstraction.coordinates, abstraction.flatten(state).T, strict=True))

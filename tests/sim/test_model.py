@@ -1,4 +1,4 @@
-"""Finding models, telling them apart, and where their sensors lie."""
+"""Paths and fingerprints of models, and the slices of their sensors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_models_are_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
 
 
 def test_a_fingerprint_is_the_physics() -> None:
-    """Equal for equal models, whatever else was compiled; different after any change."""
+    """A fingerprint ignores rounding and shows other changes; the compiled hash shows both."""
     seen = {name: model.fingerprint(tasks.make(name).spec()) for name in tasks.names()}
     exactly = {model.compiled_hash(tasks.make(name).spec()) for name in tasks.names()}
     assert len(set(seen.values())) == len(exactly) > 1

@@ -1,4 +1,4 @@
-"""Pushes: their forces by hand, their impulse on real bodies, the same floats in both worlds."""
+"""Pushes: forces and impulses by hand; equal floats in the batched and dm_control environments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def same(first: State, second: State) -> bool:
 
 
 def test_forces_by_hand() -> None:
-    """0.1 s is three control steps of 1/30 s; a step covered by a half gets half of the force."""
+    """0.1 s are three control steps of 1/30 s; a step covered by half gets half of the force."""
     times = np.arange(6) / 30
     push = Push(time=1 / 30, duration=0.1, force=np.array([100.0, 0.0, 0.0]))
     assert push.during(times, 1 / 30)[:, 0].tolist() == [0.0, 100.0, 100.0, 100.0, 0.0, 0.0]
@@ -35,7 +35,7 @@ def test_forces_by_hand() -> None:
     each = Push(
         time=np.array([0.0, 0.1]), duration=np.array([0.1, 0.02]), force=np.eye(3)[:2] * 10.0
     )
-    now = each.during(np.array([0.08, 0.08]), 0.04)  # half of the step; half of the step
+    now = each.during(np.array([0.08, 0.08]), 0.04)  # each push covers half of the step
     np.testing.assert_allclose(now, [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]], rtol=1e-9)
 
 
@@ -93,7 +93,7 @@ def rows(start: Start, count: int) -> Start:
 
 @pytest.mark.parametrize("name", tasks.names())
 def test_pushed_episodes_are_equal(name: str) -> None:
-    """Batched, a push of its own for each row, on more than one thread; and one by one."""
+    """Batched, with a different push in each row and two threads, equals one by one."""
     task = tasks.make(name)
     rng = np.random.default_rng(0)
     count, steps = 4, min(task.horizon, 180)
@@ -132,7 +132,7 @@ def test_a_push_that_is_taken_away_ends() -> None:
 
 
 def test_a_new_episode_is_pushed_again() -> None:
-    """The push belongs to the episode's clock, not to the environment's."""
+    """The time of a push counts from the start of each episode."""
     push = Push(0.1, 0.1, np.array([5.0, 0.0, 0.0]))
     batch = tsbench.load_batched("rocket_navigation", count=2, push=push, threads=1)
     batch.reset()

@@ -1,4 +1,4 @@
-"""mujoco's warnings: counted, not written, and left to others where no batch computes."""
+"""mujoco's warnings: counted, not written, and unchanged outside the simulations of tsbench."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from tsbench.sim.quiet import Quiet
 
-# What is under way by the end of a program: two robots, one of which is too fast to be computed.
+# A program that steps two robots, one of which is too fast to be computed.
 BATCH = """
 import mujoco, numpy
 from tsbench import tasks
@@ -53,7 +53,7 @@ assert heard, "its own simulations are still heard of"
     ids=["batch", "batch of one who listens", "one"],
 )
 def test_nothing_is_written(program: str, tmp_path: Path) -> None:
-    """To the error stream or a file, though mujoco's own handler would."""
+    """No warning on the error stream or in a file, where mujoco's own handler would write it."""
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path
     )

@@ -1,4 +1,4 @@
-"""The dm_control environment: endings, starts, and what it shows of the physics."""
+"""The dm_control environment: endings, starts, and agreement of states with the physics."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_horizon_is_counted_in_steps() -> None:
 
 
 def test_a_terminal_state_at_the_last_step_is_terminal() -> None:
-    """Falling out of the world after the given number of steps: at the horizon, before, after."""
+    """A rocket leaves the world in its last step, or would leave it in the step after."""
     rocket = cast(Rocket, tasks.make("rocket_navigation"))
     falling = tsbench.load("rocket_navigation")
     falling.reset()
@@ -88,7 +88,7 @@ def test_laikagos_state_is_that_of_the_physics() -> None:
     for index, foot in enumerate(("FR_foot", "FL_foot", "RR_foot", "RL_foot")):
         np.testing.assert_array_equal(state.feet[0, index], env.physics.named.data.site_xpos[foot])
     np.testing.assert_array_equal(state.com[0], env.physics.named.data.subtree_com["trunk"])
-    # What the actuators are told is the filtered action, which the state remembers.
+    # The actuators get the filtered action, which the state stores.
     np.testing.assert_array_equal(
         data.ctrl, np.tile([0.0, 0.67, -1.33], 4) + state.filter[0, 24:36]
     )
@@ -124,7 +124,8 @@ def test_an_episode_along_the_reference_is_shorter(
 
 
 def test_actions_of_other_shapes_are_refused() -> None:
-    """numpy would stretch one number over all joints, and leave out what a rocket has none of."""
+    """numpy would broadcast one number over all joints, and the rocket would ignore surplus
+    ones."""
     trot = tsbench.load("laikago_trot")
     trot.reset()
     with pytest.raises(tsbench.TsbenchError, match=r"action has shape \(1,\), not \(12,\)"):

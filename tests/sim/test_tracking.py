@@ -88,7 +88,7 @@ def test_only_reward_start_and_ending_differ(imitation: Imitation[Any]) -> None:
 
 
 def test_starts(imitation: Imitation[Any]) -> None:
-    """Along the reference in training; near the task's own start when asked for."""
+    """Starts lie along the reference in training, and near the task's own start if perturbed."""
     count = 200
     along = imitation.start(np.random.default_rng(0), count)
     assert np.sum(along.time > 0.0) > count / 2
@@ -132,7 +132,7 @@ def test_form(naive_reference: Callable[[str], ReferenceMotion]) -> None:
 def test_following_the_reference_pays_more_and_more(
     naive_reference: Callable[[str], ReferenceMotion],
 ) -> None:
-    """The progress form rises along the way, 60 m, from 0.1 to 1."""
+    """The reward of the progress form rises from 0.1 to 1 along the way of 60 m."""
     name = "rocket_obstacles"
     reference = naive_reference(name)
     task = Imitation(tasks.make(name), reference)

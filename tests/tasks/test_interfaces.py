@@ -1,6 +1,6 @@
-"""What a task may leave out: a planning variant, a distance among its constants, feet to track.
+"""Tasks without the optional parts: a planning variant, a distance constant, feet to track.
 
-The cart is the smallest task there is: a mass on a rail that has to stop at a mark.
+The cart is a minimal task: a mass on a rail that has to stop at a mark.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class Rails(Abstraction[CartState]):
 
 
 class FollowTip(Tracker[CartState]):
-    """A reward that compares something that Laikago knows nothing of."""
+    """A tracking reward on an array that Laikago's reference motions do not have."""
 
     max_reward = 1.0
 
@@ -177,7 +177,7 @@ class PlannableCart(Cart, Plannable[CartState]):
 
 
 def problem(task: Task[Any], tmp_path: Path) -> tuple[Problem, Any]:
-    """With the smallest budget that learns at all, and a workspace that keeps nothing."""
+    """A problem with a minimal budget, and a workspace in `tmp_path`."""
     monitor = SimpleNamespace(saved=None, update=lambda *_: None)
     desk = SimpleNamespace(
         directory=tmp_path, stage=lambda name, steps: nullcontext(monitor), note=lambda line: None

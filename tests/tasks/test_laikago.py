@@ -439,7 +439,7 @@ VARIANTS: tuple[tsbench.Variant | None, ...] = (None, *tsbench.VARIANTS)
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", GAITS)
 def test_both_endings_happen(name: str, variant: tsbench.Variant | None) -> None:
-    """Who stands still lasts to the horizon; folded legs fall, and a plan may stray."""
+    """A standing robot lasts to the horizon. Folded legs fall, and a plan strays from the goal."""
     environment = Case(name, variant).load(seed=3, perturbed=False)
     if variant == "planning":
         still, away = np.zeros(7), -np.ones(7)
@@ -553,7 +553,7 @@ def test_reference_of_the_naive_plan(
     planned = len(plan.times)
     assert planned < task.horizon  # it arrives early, and the reference goes on
     np.testing.assert_array_equal(reference.tracked["contacts"], task.gait.contacts(times))
-    # The base goes straight ahead at top speed, once the feet have left their hips' sides.
+    # The base moves straight ahead at top speed once the feet have left their place under the hips.
     speed = task.gait.base_speed
     np.testing.assert_allclose(reference.qpos[:planned, 0], speed * times[:planned], atol=0.03)
     np.testing.assert_allclose(reference.qpos[:, 1:3], [[0.0, 0.42]] * len(times), atol=1e-3)
@@ -598,7 +598,7 @@ def test_a_swing_by_hand(
 ) -> None:
     """Trot, FL lifts off at frame 0 and touches down at frame 8; frame 2 is a quarter of the way.
 
-    It starts under its hip. Then it stands until frame 16 where the plan lets it stand.
+    The foot starts under its hip. Then it stands at its planned position until frame 16.
     """
     plan, reference = naive_plan("laikago_trot"), naive_reference("laikago_trot")
     planned = np.interp(reference.times, plan.times, plan.states[:, 3 + 3 * FL])
@@ -675,7 +675,7 @@ def test_audit_finds_what_is_wrong(
 
 @pytest.mark.parametrize("name", GAITS)
 def test_audit_finds_dragged_feet(name: str, naive_plan: Callable[[str], Plan]) -> None:
-    """A plan whose feet stay under their hips, on the ground or not."""
+    """The feet of the plan stay under their hips, also in stance."""
     task, plan = make(name), naive_plan(name)
     states = plan.states.copy()
     states[:, 3::3] = states[:, :1] + STANDING[:, 0]
@@ -690,7 +690,7 @@ def test_audit_finds_dragged_feet(name: str, naive_plan: Callable[[str], Plan]) 
 def on_reference(
     task: Laikago, reference: ReferenceMotion, frame: int, qpos: np.ndarray | None = None
 ) -> LaikagoState:
-    """The state of a robot that is where the reference's frame is, or at `qpos` then."""
+    """The state of a robot in the pose of a reference frame, or in `qpos` at its time."""
     physics = Physics(task, 1, threads=1)
     qpos = reference.qpos[frame] if qpos is None else qpos
     time = np.array([frame * STEP])
@@ -729,7 +729,7 @@ def test_tracking_terms(naive_reference: Callable[[str], ReferenceMotion]) -> No
     }
     for field, (value, expected) in off.items():
         assert tracked(task, reference, at.replace(**{field: value})) == pytest.approx(expected)
-    # Where the base is costs nothing by itself: feet are seen from it, and the CoM is given.
+    # The base position by itself costs nothing: feet are relative to it, and the CoM is given.
     ahead = at.replace(base_position=at.base_position + 0.5, feet=at.feet + 0.5)
     assert tracked(task, reference, ahead) == pytest.approx(1.0)
 

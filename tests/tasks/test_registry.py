@@ -10,7 +10,7 @@ import tsbench
 from tsbench import TsbenchError, tasks
 
 SOME = tasks.names()[0]
-# The tasks that have a goal at a distance, which no physics could do without.
+# The tasks that have the constant `distance`.
 FAR = [name for name in tasks.names() if "distance" in tasks.defaults(name)]
 
 

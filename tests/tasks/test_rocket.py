@@ -38,7 +38,7 @@ def state(
     spin: Any = 0.0,
     clearance: Any = (9.0, 9.0),
 ) -> RocketState:
-    """States at the positions, which share everything else."""
+    """States at the positions (n, 2), equal in everything else."""
     n = len(positions)
     return RocketState(
         time=np.zeros(n),
@@ -118,7 +118,7 @@ def test_reward_with_obstacles() -> None:
     expected = 0.9 * math.exp(-0.25 * math.hypot(20.0, 3.0)) - 0.0275909581
     expected -= 0.075 * math.exp(-0.5 * math.hypot(20.0, 4.0))
     np.testing.assert_allclose(reward(task, state(aside)), expected, atol=1e-9)
-    # Only where they are near do they cost anything.
+    # Obstacles cost something only nearby.
     np.testing.assert_allclose(reward(task, state(GOAL)), 0.9 - 0.075 * math.exp(-10.0), atol=1e-4)
 
 
@@ -250,8 +250,8 @@ NAMES = ("rocket_navigation", "rocket_obstacles")
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", NAMES)
 def test_both_endings_happen(name: str, variant: tsbench.Variant | None) -> None:
-    """Who hovers lasts to the horizon, who falls leaves the world; in a plan, who stands still
-    and who flies down."""
+    """A hovering rocket lasts to the horizon, and a falling one leaves the world. In a plan the
+    same holds for a resting and a descending one."""
     environment = Case(name, variant).load(seed=3, perturbed=False)
     if variant == "planning":
         hover, away = itertools.cycle([np.zeros(3)]), -np.ones(3)
@@ -345,7 +345,7 @@ def test_clearance_is_measured_from_the_hull(offset: tuple[float, float], cleara
 
 
 def test_a_collision_is_a_contact() -> None:
-    """Where the sensors say collision the physics has a contact, and nowhere else."""
+    """The sensors report a collision exactly where the physics has a contact."""
     task = rocket("rocket_obstacles")
     model = task.spec().compile()
     data = mujoco.MjData(model)

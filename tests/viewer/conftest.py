@@ -1,4 +1,4 @@
-"""What tests of pictures share: runs that nobody trained, and a marker for those with a browser."""
+"""Fixtures of the viewer's tests: runs made without training, and a marker for browser tests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def steady(name: str, *action: float) -> Policy:
-    """A policy for the task that always does the same."""
+    """A policy for the task with a constant action."""
     task = tasks.make(name)
     layers = (task.observation_size, 1, task.action_size)
     info = PolicyInfo(name, task.version, fingerprint(task.spec()), "none", "tanh", layers)
@@ -45,7 +45,7 @@ def make_run(
     naive_reference: Callable[[str], ReferenceMotion],
     invented_record: Callable[[str], Record],
 ) -> Callable[..., Path]:
-    """Makes the directory of a run of a task, with the hand-made plan and a steady policy."""
+    """A function that makes a run directory with the hand-made plan and a constant policy."""
 
     def make(name: str, *action: float, directory: str = "run") -> Path:
         path = tmp_path / directory

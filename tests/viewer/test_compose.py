@@ -1,4 +1,4 @@
-"""What is shown of a recording, and when."""
+"""Shows made from recordings: their actors, props, legend and timeline."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_an_arrow_is_there_while_the_push_lasts_and_points_where_it_goes() -> No
     np.testing.assert_allclose(axis, [0.0, 1.0, 0.0], atol=1e-9)
     tip = arrow.position[16] + arrow.size[1] * axis
     to_body = recording.qpos[16, :3] - tip
-    assert to_body[1] > 0.0  # it comes from where the push comes from
+    assert to_body[1] > 0.0  # the arrow lies on the side that the push comes from
     assert np.linalg.norm(to_body) < 0.3
     assert "push" in {entry.name for entry in show.legend}
     assert not [prop for prop in compose(stands(), None, title="").props if "push" in prop.name]

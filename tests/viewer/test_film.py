@@ -1,4 +1,4 @@
-"""Videos and motion strips, made as a user makes them: drawn with what works here."""
+"""Videos and motion strips, made by the command line with the OpenGL library that works here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tsbench.viewer.show import PLAN_COLOUR, PUSH_COLOUR, Actor, Show
 
 
 def near(picture: NDArray[np.int64], colour: tuple[float, float, float]) -> int:
-    """How many pixels have about this hue: their brightest channels are the colour's."""
+    """The number of pixels with about this hue: the colour's brightest channels are theirs."""
     target = np.array(colour) / max(colour)
     bright = picture.max(axis=-1, keepdims=True)
     close = np.abs(picture / np.maximum(bright, 1) - target).max(axis=-1) < 0.25
@@ -59,7 +59,7 @@ def test_a_strip_shows_the_plan_above_the_execution_and_a_push_while_it_lasts(
 
 
 def test_a_video_is_as_long_as_the_show(make_run: Callable[..., Path], tmp_path: Path) -> None:
-    """A rocket that never fires leaves its world below in 3 s."""
+    """A rocket that never fires falls out of its world within 3 s."""
     run, path = make_run("rocket_navigation", -1.0), tmp_path / "fall.mp4"
     (run / "reference.npz").unlink()
     view(str(run), "--video", str(path))

@@ -1,4 +1,4 @@
-"""The page: one file that needs nothing else, and what a reader sees in it."""
+"""The page: a self-contained file, and its look in a browser."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def rocket() -> mujoco.MjModel:
 
 
 def trot(model: mujoco.MjModel, speed: float, timestep: float, duration: float) -> scene.Array:
-    """Something like a trot, straight ahead, as qpos (T, nq)."""
+    """A rough trot, straight ahead, as qpos (T, nq)."""
     times = np.arange(0.0, duration + 1e-9, timestep)
     qpos = np.tile(model.key_qpos[0], (len(times), 1))
     qpos[:, 0] += speed * times
@@ -76,7 +76,7 @@ def trot(model: mujoco.MjModel, speed: float, timestep: float, duration: float) 
 
 
 def flight(timestep: float, late: float = 0.0) -> scene.Array:
-    """From the start to the goal of the rocket in 10 s, as qpos (T, 3)."""
+    """A flight from the rocket's start to its goal in 10 s, as qpos (T, 3)."""
     progress = np.clip((np.arange(0.0, 12.0, timestep) - late) / 10.0, 0.0, 1.0)
     sway = np.sin(np.pi * progress)
     x, _, z = ROCKET_GOAL
@@ -93,7 +93,7 @@ def show(
     title: str = "",
     summary: list[tuple[str, str]] | None = None,
 ) -> Show:
-    """Bare motions, with nothing to explain them."""
+    """A show of motions without props."""
     actors = [Actor("executed", executed, timestep, EXECUTED_COLOUR, "")]
     if ghost is not None:
         actors.append(Actor("plan", ghost, ghost_timestep or timestep, PLAN_COLOUR, "", ghost=True))
@@ -202,7 +202,7 @@ def test_motions_of_another_model_are_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-# What is in it
+# The content
 
 
 def test_tracks_are_thinned_and_keep_the_end() -> None:
@@ -304,7 +304,7 @@ def test_the_camera_looks_from_where_motion_goes_from_left_to_right() -> None:
         assert view.direction[2] > 0.0
 
 
-# What is seen
+# The look in a browser
 
 
 WIDTH, HEIGHT = 1000, 560
@@ -317,10 +317,10 @@ DRAWN = """new Promise((done) => {
 
 
 class Browser:
-    """Headless Chromium with software WebGL, led by its DevTools protocol.
+    """Headless Chromium with software WebGL, controlled by its DevTools protocol.
 
-    Chromium's own flags for a picture (--virtual-time-budget, --screenshot) would do, but on a busy
-    machine its virtual time now and then stands still for good.
+    Chromium's flags --virtual-time-budget and --screenshot are not used: on a busy machine its
+    virtual time sometimes stops for good.
     """
 
     def __init__(self, connection: ClientConnection) -> None:
@@ -330,7 +330,7 @@ class Browser:
         self._spoken: list[str] = []
 
     def call(self, method: str, **parameters: Any) -> Any:
-        """Gives a command and returns its result; what the page says meanwhile is kept."""
+        """Sends a command and returns its result; keeps the page's messages that arrive before."""
         number = next(self._calls)
         message = {"id": number, "method": method, "params": parameters}
         if self._session:
@@ -346,7 +346,7 @@ class Browser:
 
     @contextmanager
     def open(self, url: str) -> Iterator[None]:
-        """A page, drawn; in the end the test fails if there was anything on its console."""
+        """Opens a page and waits until it is drawn. A console message then fails the test."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)
         self._session, self._spoken = session["sessionId"], []
@@ -357,14 +357,14 @@ class Browser:
         self.call("Page.navigate", url=url)
         self.ask(DRAWN)
         yield
-        # Of Chromium's own, about taking the picture.
+        # Chromium itself writes this line about the screenshot.
         unexpected = [line for line in self._spoken if "GPU stall due to ReadPixels" not in line]
         self._session = None
         self.call("Target.closeTarget", targetId=target)
         assert not unexpected
 
     def ask(self, expression: str) -> Any:
-        """The value of an expression in the page, once it has one if it is a promise."""
+        """The value of an expression in the page; waits for a promise."""
         result = self.call(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )
@@ -372,7 +372,7 @@ class Browser:
         return result["result"].get("value")
 
     def screenshot(self, name: str) -> NDArray[np.int64]:
-        """The page as it is seen, kept under that name, shape (rows, columns, 3)."""
+        """A screenshot of the page, saved under that name, shape (rows, columns, 3)."""
         content = base64.b64decode(self.call("Page.captureScreenshot")["data"])
         SCREENSHOTS.mkdir(exist_ok=True)
         (SCREENSHOTS / f"{name}.png").write_bytes(content)
@@ -381,7 +381,7 @@ class Browser:
         return pixels
 
     def picture(self, path: Path, address: str) -> NDArray[np.int64]:
-        """What is seen of a page between its card and its bar, shape (rows, columns, 3)."""
+        """A screenshot of a page between its card and its bar, shape (rows, columns, 3)."""
         with self.open(f"{path.as_uri()}#{address}"):
             name = f"{path.stem}_{re.sub('[^a-z0-9]+', '_', address)}"
             return self.screenshot(name)[30 : HEIGHT - 70, 330:]
@@ -438,7 +438,7 @@ def dark(pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def solid(pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """What is neither sky nor a thin line on it."""
+    """The pixels that are neither sky nor a thin line on it."""
     return np.abs(pixels - SKY).max(axis=-1) > 25
 
 
@@ -468,8 +468,8 @@ def test_robot_and_plan_are_seen_and_move(browser: Browser, tmp_path: Path) -> N
     assert centre(dark(late)) > centre(dark(early)) + 50
     assert orange(late).sum() > 2 * orange(early).sum()  # the path grows
 
-    # The plan's path stays; what is blue in one picture only is the plan's robot, ahead of the
-    # executed one.
+    # The plan's path is in both pictures. Pixels blue in one only are the plan's robot, which is
+    # ahead of the executed one.
     moved = blue(late) & ~blue(early)
     assert moved.sum() > 200
     assert centre(moved) > centre(blue(early) & ~blue(late)) + 50
@@ -500,7 +500,7 @@ def test_a_small_rocket_in_a_large_world_is_seen(browser: Browser, tmp_path: Pat
     assert orange(whole).sum() > 100
     assert blue(whole).sum() > 300
     lens = solid(whole[-250:, -240:])
-    assert 2000 < lens.sum() < 0.5 * lens.size  # the rocket once more, larger
+    assert 2000 < lens.sum() < 0.5 * lens.size  # the rocket's close-up
     assert solid(close).sum() > 2 * lens.sum()
 
 
@@ -557,7 +557,7 @@ def test_a_report_follows_its_view(browser: Browser, make_run: Callable[..., Pat
 @pytest.mark.browser
 @pytest.mark.parametrize("name", ["quadruped", "fish"])
 def test_models_of_others_are_rendered(browser: Browser, tmp_path: Path, name: str) -> None:
-    """Between them: a plane, a height field, capsules, cylinders, ellipsoids, boxes, sites."""
+    """The models have a plane, a height field, capsules, cylinders, ellipsoids, boxes, sites."""
     model = mujoco.MjModel.from_xml_path(
         str(Path(dm_control.suite.__file__).with_name(f"{name}.xml"))
     )

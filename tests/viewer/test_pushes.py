@@ -35,7 +35,7 @@ def test_pushes_in_words(text: str, time: float, force: tuple[float, float, floa
 
 
 def test_a_push_stays_in_the_plane_that_scores_push_in() -> None:
-    """The rocket's is x-z: a heading means the same in the viewer and in a score."""
+    """The rocket's plane is x-z: a heading means the same in the viewer and in a score."""
     rocket = tasks.make("rocket_navigation")
     np.testing.assert_allclose(parse_push("9N@1s:90", rocket).force, [0, 0, 9], atol=1e-12)
     np.testing.assert_allclose(parse_push("9N@1s:-z", rocket).force, [0, 0, -9])
@@ -60,7 +60,7 @@ def test_what_is_no_push_is_told_what_one_is(text: str) -> None:
 def test_a_push_after_the_end_is_refused(make_run: Callable[..., Path]) -> None:
     run = str(make_run("rocket_navigation"))
     assert subject(run).show("9N@3.6s:+x").title
-    late = "9N@3.7s:+x"  # it has fallen out of the world by then
+    late = "9N@3.7s:+x"  # the rocket has fallen out of the world by then
     with pytest.raises(TsbenchError, match=r"a push at 3\.7 s comes after .* end at 3\.68 s"):
         subject(run).show(late)
     with pytest.raises(TsbenchError, match="comes after"):

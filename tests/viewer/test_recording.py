@@ -1,4 +1,4 @@
-"""Recordings: what the physics did, and nothing else."""
+"""Recordings: they hold exactly the values of the physics."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def test_reward_terms_make_up_the_reward() -> None:
 
 
 def test_who_stands_still_is_held_where_his_mass_is() -> None:
-    """At rest all four feet press, their pressures balance the weight about the centre of mass."""
+    """At rest all four feet press on the ground, and the centre of pressure is below the centre of
+    mass."""
     recording = record_episode(tasks.make("laikago_trot"), steadily(*[0.0] * 12))
     support = recording.support
     assert support.contacts[90:].all()

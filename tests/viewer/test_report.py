@@ -1,4 +1,4 @@
-"""The report: what it says is what was scored and recorded."""
+"""The report: its figures are those of the score and the recording."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MakeRun = Callable[..., Path]
 
 
 def words_of(text: str) -> str:
-    """The page's own text, without the view inside it."""
+    """The report's own text, without the embedded view."""
     return re.sub(r'srcdoc="[^"]*"', "", text)
 
 

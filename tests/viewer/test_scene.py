@@ -1,4 +1,4 @@
-"""The converter: every shape at its place, in its colour, for every model that is at hand."""
+"""The converter: the pose and colour of every shape, for every model at hand."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_every_model_is_drawn(path: Path) -> None:
 def test_shapes_have_their_size_at_their_place(
     name: str, half_sizes: tuple[float, float, float]
 ) -> None:
-    """In the frame that MuJoCo gives for it, a shape spans just its sizes."""
+    """A shape spans exactly its sizes in the frame that MuJoCo gives for it."""
     model = compiled(SHAPES)
     data = mujoco.MjData(model)
     data.qpos[:3] += (1.0, 2.0, 3.0)
@@ -144,7 +144,7 @@ def test_shapes_have_their_size_at_their_place(
 
 
 def test_a_mesh_is_where_its_vertices_are() -> None:
-    """MuJoCo moves meshes to their inertial frame; in the body's frame they come out as given."""
+    """MuJoCo moves meshes to their inertial frame; the part moves them back to the MJCF's place."""
     model = compiled(SHAPES)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

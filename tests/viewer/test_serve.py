@@ -83,7 +83,7 @@ def test_the_command_says_where_and_ends_at_ctrl_c(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # As a shell starts what it puts in the background: with Ctrl-C ignored.
+        # A shell starts a background process with Ctrl-C ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     ) as process:
         try:
@@ -95,7 +95,7 @@ def test_the_command_says_where_and_ends_at_ctrl_c(
             process.send_signal(signal.SIGINT)
             _, errors = process.communicate(timeout=30)
         finally:
-            process.kill()  # or leaving the context would wait for it
+            process.kill()  # otherwise the end of the context waits for it
     assert (status, process.returncode, errors) == (200, 0, "")
     assert "<b>push</b>" in text  # the legend
     assert '"served": true' in text

@@ -1,7 +1,9 @@
-"""How fast tsbench is, and what else is: ratios measured side by side in one run.
+"""Benchmarks of speed: ratios of alternatives measured in turns in one run.
 
-A comparison is one file here: a docstring whose first line says what is compared, and a function
-with `@comparison("NAME")`. There is no list to edit; `tsbench bench --only NAME` finds it.
+A comparison is one file in this package, with a docstring whose first line names the compared
+things, and a function with `@comparison("NAME")`. There is no list to edit: `tsbench bench --only
+NAME` finds it. Comparisons with libraries that tsbench does not need are in benchmarks/, outside
+the package.
 """
 
 from __future__ import annotations
@@ -21,14 +23,14 @@ from typing import Any
 from tsbench.bench.turns import FULL, QUICK, Effort, Range
 from tsbench.core.errors import unknown
 
-# What can change a figure.
+# Packages whose version can change a figure.
 PACKAGES = ("mujoco", "numpy", "torch", "rsl-rl-lib", "dm-control", "gymnasium", "mink")
 EXTRAS = ("envpool", "stable-baselines3")
 INSTALL = "pip install 'tsbench[bench]'"
 
 
 def machine() -> dict[str, Any]:
-    """Where this is, and with which versions."""
+    """The processor, system and package versions of this machine."""
     found: dict[str, Any] = {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -52,11 +54,13 @@ def _processor() -> str:
 
 @dataclass
 class Findings:
-    """Attributes:
-    figures: what was measured, such as `laikago.batched`, with units.
-    ratios: of what was measured side by side, such as `laikago.batched/rollout`.
-    notes: what to know about them, and what could not be measured.
-    machine: where, and with which versions.
+    """The results of comparisons.
+
+    Attributes:
+        figures: measured quantities with units, such as `laikago.batched`.
+        ratios: ratios of quantities measured in turns, such as `laikago.batched/rollout`.
+        notes: remarks on the results, and comparisons that could not be run.
+        machine: the machine and its package versions.
     """
 
     figures: dict[str, Range] = field(default_factory=dict)
@@ -70,7 +74,7 @@ class Findings:
         self.notes += other.notes
 
     def as_dict(self) -> dict[str, Any]:
-        """For `--json`: `ratios` are medians, `ranges` their least and most."""
+        """The content of the `--json` file: `ratios` holds medians, `ranges` least and most."""
         return {
             "ratios": {name: ratio.median for name, ratio in self.ratios.items()},
             "ranges": {name: [ratio.least, ratio.most] for name, ratio in self.ratios.items()},
@@ -85,10 +89,12 @@ Compare = Callable[[Effort], Findings]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Attributes:
-    compare: measures, with a given effort.
-    requires: modules beyond tsbench's own that it cannot do without.
-    named: whether it takes so long that it is only run when it is named.
+    """A registered comparison.
+
+    Attributes:
+        compare: measures with a given effort.
+        requires: modules of optional packages that it needs.
+        named: whether it runs only when it is named, because it takes long.
     """
 
     compare: Compare
@@ -102,7 +108,16 @@ _comparisons: dict[str, Comparison] = {}
 def comparison(
     name: str, *, requires: tuple[str, ...] = (), named: bool = False
 ) -> Callable[[Compare], Compare]:
-    """Adds a comparison, under the name that `--only` takes."""
+    """Registers a comparison under the name that `--only` takes.
+
+    Args:
+        name: the name.
+        requires: modules of optional packages that it needs.
+        named: whether it runs only when it is named.
+
+    Raises:
+        ValueError: the name is taken.
+    """
 
     def add(compare: Compare) -> Compare:
         if name in _comparisons:
@@ -115,7 +130,7 @@ def comparison(
 
 @cache
 def names() -> tuple[str, ...]:
-    """All comparisons, sorted."""
+    """The names of all comparisons, sorted."""
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
     return tuple(sorted(_comparisons))
@@ -125,7 +140,7 @@ def find(name: str) -> Comparison:
     """The comparison of that name.
 
     Raises:
-        TsbenchError: there is none.
+        TsbenchError: no comparison has that name.
     """
     if name not in names():
         raise unknown("comparison", name, names())
@@ -135,12 +150,12 @@ def find(name: str) -> Comparison:
 def measure(
     only: str | None = None, *, quick: bool = False, tell: Callable[[str], None] = lambda _: None
 ) -> Findings:
-    """Runs the comparisons, or one of them.
+    """Runs one comparison, or all of them.
 
     Args:
-        only: its name; None for all that do not have to be named.
-        quick: seconds instead of minutes, and larger ranges.
-        tell: is told what is being measured.
+        only: name of the comparison; None runs all that do not have to be named.
+        quick: measures for seconds instead of minutes, with larger ranges.
+        tell: takes the name of each comparison before it runs.
 
     Raises:
         TsbenchError: `only` names no comparison.

@@ -1,4 +1,4 @@
-"""The batched environment as environments and threads grow."""
+"""The speed of the batched environment by number of environments and of threads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DOMAINS = {"laikago": "laikago_trot", "rocket": "rocket_obstacles"}
 
 @comparison("scaling")
 def compare(effort: Effort) -> Findings:
-    """Rates by the number of environments, then by threads; ratios to those of the least."""
+    """Rates by number of environments and by number of threads, and ratios to the smallest."""
     findings = Findings()
     for domain, name in DOMAINS.items():
         task = tasks.make(name)

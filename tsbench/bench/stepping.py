@@ -1,14 +1,14 @@
 """The batched environment against bare physics, a plain loop and Gymnasium's AsyncVectorEnv.
 
-All do control steps of the same task with the same kind of random actions:
+All cases make control steps of the same task with the same kind of random actions:
 
-* `rollout`: bare `mujoco.rollout` from states and with controls that the batched environment went
-  through. States out; no sensors of the new state, no MDP, no resets. The limit.
-* `batched`: our environment. Actions in, observations, rewards, endings and resets out.
+* `rollout`: bare `mujoco.rollout` over states and controls recorded from the batched environment.
+  It computes states only: no sensors of the new state, no MDP, no resets. It is the upper limit.
+* `batched`: tsbench's batched environment, from actions to observations, rewards, endings, resets.
 * `loop`: a plain loop over one dm_control environment.
-* `async`: Gymnasium's AsyncVectorEnv, a process for each environment.
+* `async`: Gymnasium's AsyncVectorEnv, with one process for each environment.
 * `planning`: the batched planning variant, whose steps are kinematic.
-* `planning_ik`: the planning variant's dm_control environment, where mink finds full poses.
+* `planning_ik`: the planning variant's dm_control environment, where mink solves for full poses.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.physics import Physics
 from tsbench.sim.single import environment
 
-NOISE = 0.2  # standard deviation of actions: robots move, and stand for a while
+NOISE = 0.2  # standard deviation of actions: the robots move, and do not fall at once
 RECORDED = 40  # control steps that the bare rollout repeats
-SINGLE_STEPS = 8  # of a single environment at a time
-PROCESSES = 4  # of AsyncVectorEnv for each core: one that is late leaves none idle
+SINGLE_STEPS = 8  # steps of a single environment between two looks at the clock
+PROCESSES = 4  # AsyncVectorEnv's processes for each core, so that a slow one leaves no core idle
 
 RATIOS = (
     ("batched", "rollout"),
@@ -97,14 +97,14 @@ def loop(name: str, mdp: Task[Any] | Planning[Any]) -> Case:
 
     def steps() -> int:
         for action in random_actions(rng, mdp, SINGLE_STEPS):
-            single.step(action)  # begins anew by itself
+            single.step(action)  # starts the next episode by itself
         return SINGLE_STEPS
 
     return Case(name, steps)
 
 
 def asynchronous(task: Task[Any]) -> Case:
-    """Gymnasium's own way to use all cores."""
+    """Gymnasium's AsyncVectorEnv on all cores."""
     count = PROCESSES * (os.cpu_count() or 1)
     vector = AsyncVectorEnv([lambda: GymEnvironment(environment(task, seed=0))] * count)
     rng = np.random.default_rng(0)
@@ -118,7 +118,7 @@ def asynchronous(task: Task[Any]) -> Case:
 
 
 def rollout(task: Task[Any], count: int) -> Case:
-    """Bare physics through what the batched environment goes through."""
+    """Bare physics from states and with controls recorded from the batched environment."""
     physics: Physics[Any] = Physics(task, count)
     batch = BatchedEnvironment(task, physics, count, seed=0)
     rng = np.random.default_rng(0)
@@ -132,7 +132,7 @@ def rollout(task: Task[Any], count: int) -> Case:
 
 
 def full_states(batch: mujoco.batch.Batch) -> np.ndarray:
-    """The states of all simulations as `mujoco.rollout` takes them, shape (n, size)."""
+    """The states of all n simulations in the layout of `mujoco.rollout`, shape (n, size)."""
     states = [batch.bind(name) for name in ("qpos", "qvel")]
     time = np.zeros((batch.nsim, 1))
     return np.concatenate([time, *states], axis=1)

@@ -1,4 +1,4 @@
-"""What was measured, as the user sees it."""
+"""The table that `tsbench bench` prints."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tsbench.bench import Findings
 
 
 def show(console: Console, findings: Findings) -> None:
-    """Prints what was measured, and what it is measured against.
+    """Prints figures, ratios, notes and the machine.
 
     Args:
-        console: to print on.
-        findings: of `tsbench bench`.
+        console: prints them.
+        findings: the results of comparisons.
     """
     for title, ranges in (("figures", findings.figures), ("ratios", findings.ratios)):
         table = Table(box=SIMPLE_HEAD, pad_edge=False)

@@ -1,7 +1,7 @@
-"""Where the time of a training goes: physics, MDP math, network inference, update, records.
+"""The shares of a training's time: physics, MDP math, network inference, update, records.
 
-The planning and the imitation stage run as in `tsbench run`, with the settings that budget=fast has
-and records in files, only shorter. What is imitated is the plan of the hand-made planner.
+The planning and the imitation stage run as in `tsbench run budget=fast`, with records in files, but
+for fewer iterations. The imitation follows the plan of the hand-made planner.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def compare(effort: Effort) -> Findings:
 
 
 def train(problem: Problem, stage: str, steps: int) -> list[dict[str, float]]:
-    """The records of a stage's iterations."""
+    """Trains a stage; returns the record of each iteration."""
     with tempfile.TemporaryDirectory() as folder:
         workspace = RunWorkspace(Path(folder), Console(quiet=True))
         if stage == "plan":
@@ -57,8 +57,14 @@ def train(problem: Problem, stage: str, steps: int) -> list[dict[str, float]]:
 
 
 def split(name: str, rows: list[dict[str, float]], steps: int) -> Findings:
-    """Shares of the time of iterations of that many steps, but for the first, which allocates:
-    an iteration's record tells when it ended."""
+    """The shares of an iteration's time.
+
+    Args:
+        name: prefix of the figures' names.
+        rows: the record of each iteration, with its end time. The first iteration is left out,
+            because it allocates memory.
+        steps: environment steps of an iteration.
+    """
     whole = np.diff([row["seconds"] for row in rows])
     collect, update, environment, physics = (
         np.array([row[f"{part}_seconds"] for row in rows[1:]])

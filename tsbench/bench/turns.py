@@ -1,4 +1,4 @@
-"""Things measured in turns, so that whatever else the machine does meanwhile falls on all."""
+"""Measures cases in turns, so that other load on the machine affects all of them alike."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Effort:
 
     Attributes:
         repeats: turns of every case.
-        seconds: of a turn.
+        seconds: duration of a turn.
         count: environments in a batch.
-        counts: the numbers of environments that are compared with each other.
-        iterations: of a training whose time is split.
-        budget: of a training that is to get somewhere.
+        counts: numbers of environments that `scaling` compares.
+        iterations: iterations of a training whose time is split.
+        budget: budget of a training that is compared by its score.
     """
 
     repeats: int
@@ -52,10 +52,12 @@ class Range:
 
 @dataclass(frozen=True)
 class Case:
-    """Attributes:
-    name: what is measured.
-    steps: does some control steps, all environments counted, and returns their number.
-    close: ends what it has started.
+    """A thing to measure.
+
+    Attributes:
+        name: its name.
+        steps: makes some control steps and returns their number, summed over environments.
+        close: releases its processes and threads.
     """
 
     name: str
@@ -65,7 +67,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Rates:
-    """Control steps per second: for each case, one value for each turn."""
+    """Control steps per second of each case, one value for each turn."""
 
     turns: dict[str, np.ndarray]
 
@@ -73,7 +75,7 @@ class Rates:
         return Range.of(self.turns[name], "steps/s")
 
     def ratio(self, over: str, under: str) -> Range:
-        """Turn by turn, as the two took them one after the other."""
+        """The range of the ratios of two cases, one ratio for each turn."""
         return Range.of(self.turns[over] / self.turns[under])
 
 
@@ -81,7 +83,7 @@ def take_turns(cases: Sequence[Case], effort: Effort) -> Rates:
     """Measures the cases in turns, and closes them."""
     turns: dict[str, list[float]] = {case.name: [] for case in cases}
     for case in cases:
-        case.steps()  # the first one allocates
+        case.steps()  # the first call allocates memory
     for _ in range(effort.repeats):
         for case in cases:
             done, elapsed, began = 0, 0.0, time.perf_counter()

@@ -1,8 +1,8 @@
-"""From the words of `tsbench run` to jobs: one run, or a sweep that Hydra's launcher starts.
+"""Starts the jobs of `tsbench run`: one run, or a sweep through Hydra's launcher.
 
-One run needs nothing of Hydra but its grammar and its composition of configurations (`config`). For
-sweeps, and to show what it knows, Hydra's own object is used, as `hydra.core.global_hydra` hands it
-out: `hydra.main` would read the words from the process's own command line.
+A single run uses only Hydra's grammar and composition of configurations (`runs.config`). Sweeps and
+Hydra's own help use the Hydra object of `hydra.core.global_hydra`, because `hydra.main` would read
+the words from the command line of the process.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from tsbench.viewer.report import write_pages
 
 RUNS = Path("runs")
 LONGEST_NAME = 200  # characters; file systems allow 255 bytes
-CHECKED_JOBS = 1000  # of a sweep; later ones are checked when their turn comes
+CHECKED_JOBS = 1000  # jobs of a sweep checked before it starts; later ones when they start
 PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads", "checkpoint")
 RESUME = "resume="
 
 
 def launch(words: Sequence[str], json: Path | None = None) -> None:
-    """Does what `tsbench run WORDS` asks for; every job is checked before the first one starts.
+    """Carries out `tsbench run WORDS`. Checks every job before the first one starts.
 
     Args:
-        words: of the command line.
-        json: a file that the score of one run is written to as well.
+        words: the words of the command line after `run`.
+        json: a file to which the score of a single run is written too.
 
     Raises:
-        TsbenchError: the words are wrong, or runs failed. The other runs of a sweep go on.
-        Stopped: by Ctrl-C or SIGTERM.
+        TsbenchError: the words are wrong, or a run failed. A sweep continues after a failed run.
+        Stopped: Ctrl-C or SIGTERM stopped the run.
     """
     parser = _parser()
     flags = parser.parse_intermixed_args(list(words))
@@ -74,11 +74,11 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
 
 
 def finish(directory: Path, console: Console | None = None) -> None:
-    """Tells what came out of a finished run, makes pages that it lacks, and says where they are.
+    """Shows a finished run's score, makes its missing pages, and shows their paths.
 
     Raises:
-        TsbenchError: a page cannot be made. The run is finished all the same.
-        Stopped: by Ctrl-C or SIGTERM.
+        TsbenchError: a page cannot be made. The run stays finished.
+        Stopped: Ctrl-C or SIGTERM interrupted the making of the pages.
     """
     finished, console = RunDirectory(directory), console or Console()
     record = finished.record()
@@ -99,12 +99,12 @@ def _stop(number: int) -> NoReturn:
 
 
 def placed(chosen: RunConfig, words: Sequence[str]) -> RunConfig:
-    """The configuration with the run's directory in it: the one asked for or the standard one."""
+    """The configuration with its run directory: the given one, else the standard one."""
     return replace(chosen, directory=chosen.directory or str(directory(chosen, words)))
 
 
 def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
-    """The standard run directory; words that are not part of its name are added to it."""
+    """The standard run directory. Words that change other keys are appended to its name."""
     name = f"seed{chosen.seed}-{chosen.budget}"
     for word in _own(words):
         key = word.lstrip("+~").split("=")[0]
@@ -116,12 +116,16 @@ def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
 
 
 def _own(words: Sequence[str]) -> list[str]:
-    """The words that are about the run, not about Hydra."""
+    """The words without those that configure Hydra itself."""
     return [word for word in words if not word.lstrip("+~").startswith(("hydra.", "hydra/"))]
 
 
 def _resume(place: Path) -> Path:
-    """Goes on with a run: with its training, or with the pages of a finished one."""
+    """Continues the training of an unfinished run, or makes the missing pages of a finished run.
+
+    Returns:
+        The run directory.
+    """
     found = RunDirectory(place)
     if not found.finished or found.report_file.exists():
         execute.resume(place)
@@ -132,8 +136,9 @@ def _resume(place: Path) -> Path:
 def _sweep(words: Sequence[str]) -> None:
     """Runs every combination of the values in the words, through Hydra's sweeper and launcher.
 
-    A launcher composes the configuration of its jobs where it starts them, perhaps on another
-    machine. They are composed here too, so that a mistake in the last one stops the first.
+    A launcher composes the configuration of each job when it starts the job, perhaps on another
+    machine. This function composes them all first, so that a mistake in the last job is found
+    before the first job starts.
     """
     places: set[str] = set()
     for job in islice(config.sweep(words), CHECKED_JOBS):
@@ -160,19 +165,18 @@ def _sweep(words: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class _Job:
-    """What Hydra's launcher calls for each job of a sweep, in this process or in a worker's.
+    """The function that Hydra's launcher calls for each job of a sweep, in this process or another.
 
     Attributes:
-        process: that the sweep was started in.
-        failures: words, log and error of each job that has failed in that process.
+        process: identifier of the process that started the sweep.
+        failures: words, log file and error of each job that failed in that process.
     """
 
     process: int = field(default_factory=os.getpid)
     failures: list[tuple[str, Path, Exception]] = field(default_factory=list)
 
     def __call__(self, node: DictConfig) -> float:
-        """Does what is missing of a run, and returns its normalized reward; not a number for one
-        that has failed."""
+        """Completes a run and its pages. Returns its normalized reward, NaN if it failed."""
         words = list(HydraConfig.get().overrides.task)
         chosen = placed(config.parse(node), words)
         place = RunDirectory(Path(chosen.directory or ""))
@@ -182,7 +186,7 @@ class _Job:
             return reward
         except Exception as error:
             if os.getpid() != self.process:
-                raise  # a worker has to let the failure travel back
+                raise  # the launcher brings a worker's error back to the first process
             if not isinstance(error, TsbenchError) and place.log_file.exists():
                 with place.log_file.open("a", encoding="utf-8") as file:
                     traceback.print_exc(file=file)
@@ -191,7 +195,7 @@ class _Job:
 
 
 def _show(flags: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """What Hydra can tell about the words and itself."""
+    """Shows the configuration or Hydra's own help, as the flags ask."""
     if flags.cfg:
         execute.prepare(config.compose(flags.overrides))
     words = flags.overrides = config.opened(flags.overrides)
@@ -208,7 +212,7 @@ def _show(flags: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
 
 @contextmanager
 def _hydra() -> Iterator[Any]:
-    """Hydra, with tsbench's configurations. What it raises becomes one line."""
+    """Hydra with tsbench's configurations. Its errors become TsbenchErrors of one line."""
     with (
         config.one_line_errors(),
         config.found_by_hydra(),
@@ -217,7 +221,7 @@ def _hydra() -> Iterator[Any]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """Of the words and of those of Hydra's flags that tsbench has, with Hydra's names."""
+    """The parser of the words and of the supported flags, which have Hydra's names."""
     parser = argparse.ArgumentParser("tsbench run", add_help=False, allow_abbrev=False)
     parser.error = _refuse  # type: ignore[method-assign]
     parser.add_argument("overrides", nargs="*", help="key=value words")

@@ -1,4 +1,4 @@
-"""The command line: a table of verbs, each of which imports what it needs when it is used."""
+"""The command line: a table of verbs. Each verb imports its modules when it is called."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ examples:
 
 
 JSON_HELP = "write what is shown to a new JSON file too"
-PICTURES = ("--video", "--strip")  # what OpenGL draws
+PICTURES = ("--video", "--strip")  # options that need OpenGL
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """An argument parser whose errors are TsbenchErrors of one line."""
 
     def error(self, message: str) -> NoReturn:
         raise TsbenchError(f"{message} (see {self.prog} --help)")
@@ -65,15 +65,23 @@ class Parser(argparse.ArgumentParser):
 
 @dataclass(frozen=True)
 class Verb:
-    """A command: what it does in a few words, and the function that takes its arguments."""
+    """A command.
+
+    Attributes:
+        summary: its purpose in a few words.
+        call: the function that takes its arguments and returns the exit status, None for 0.
+    """
 
     summary: str
-    call: Callable[[Sequence[str]], int | None]  # the exit status, None for 0
+    call: Callable[[Sequence[str]], int | None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command and returns the exit status: 0, 1 where a score is not what it was, 2 for a
-    user's mistake, 130 for Ctrl-C, 143 for SIGTERM."""
+    """Runs a command and returns its exit status.
+
+    The status is 0 for success, 1 for a score that differs from the recorded one or a closed
+    output, 2 for a user's mistake, 130 for Ctrl-C and 143 for SIGTERM.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         status = _dispatch(words)
@@ -84,10 +92,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(stopped), 128 + stopped.signal)
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
-    except BrokenPipeError:  # the reader of the output has left: `tsbench list | head -1`
+    except BrokenPipeError:  # the reader closed the output, as in `tsbench list | head -1`
         _drop_output()
         return 1
-    except OSError as error:  # a file that nobody took care of, or the output itself
+    except OSError as error:  # of a file without its own handling, or of the output
         _drop_output()
         return _fail(f"{error.filename or 'output'}: {error.strerror or error}", 2)
     return status
@@ -99,7 +107,7 @@ def _fail(line: str, status: int) -> int:
 
 
 def _drop_output() -> None:
-    """What is still in the buffer has nowhere to go; Python would say so at exit."""
+    """Discards the buffered output, so that Python does not report a closed output at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -121,7 +129,11 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _check_graphics() -> None:
-    """mujoco chooses OpenGL when it is imported, and fails if MUJOCO_GL names none that works."""
+    """Imports mujoco, which loads the OpenGL library that MUJOCO_GL names.
+
+    Raises:
+        TsbenchError: mujoco cannot be imported with this MUJOCO_GL.
+    """
     try:
         import mujoco  # noqa: F401
     except Exception as error:
@@ -159,7 +171,10 @@ def _run(words: Sequence[str]) -> None:
 
 
 def _complete(words: Sequence[str]) -> None:
-    """Shell completion: Hydra's, which knows nothing of verbs, with the verb taken out."""
+    """Completes verbs, and the words of `run` by Hydra's completion.
+
+    Hydra knows no verbs, so the verb is removed from the line that Hydra sees.
+    """
     line = os.environ.get("COMP_LINE", "").split(" ")
     if "install" not in words[-1] and (len(line) < 3 or line[1] != "run"):
         sys.stdout.write(" ".join(VERBS) + "\n")
@@ -219,7 +234,7 @@ def _list(words: Sequence[str]) -> None:
 
 
 def _short(steps: int) -> str:
-    """Thousands as k, millions as M, to three digits."""
+    """A number of steps to three digits, with k for thousands and M for millions."""
     for size, letter in ((1_000_000, "M"), (1_000, "k")):
         if steps >= size:
             return f"{steps / size:.3g}{letter}"
@@ -235,7 +250,11 @@ def _parser(verb: str, *, json: bool = True) -> Parser:
 
 
 def _new_file(word: str) -> Path:
-    """A path that can be written: what took hours must not be lost at its end."""
+    """The path of a new file, checked before hours of work whose result it will hold.
+
+    Raises:
+        TsbenchError: the file exists or cannot be written.
+    """
     from tsbench.core.files import check_new
 
     path = Path(word)
@@ -325,7 +344,7 @@ def _evaluate(words: Sequence[str]) -> int:
     write_json(options.json, shown)
     if agrees is False:
         if options.keep is not None:
-            console.print(" not kept: the score is not what it was", highlight=False)
+            console.print(" not kept: the score differs from the recorded one", highlight=False)
         return 1
     if options.keep is not None:
         directory.keep(run, options.keep, score)
@@ -334,10 +353,15 @@ def _evaluate(words: Sequence[str]) -> int:
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
-    """A policy and the task to evaluate it in.
+    """A policy, and the task in which it is evaluated.
+
+    Args:
+        path: a run directory, a policy file or the name of a reference policy.
+        word: task=NAME, or None.
+        trust_sb3: the stable-baselines3 algorithm that saved the file, or None.
 
     Raises:
-        TsbenchError: there is no such policy, or the word for the task is missing or wrong.
+        TsbenchError: the policy does not exist, or `word` is missing or wrong.
     """
     from tsbench import tasks
     from tsbench.evaluation import foreign, references
@@ -419,7 +443,7 @@ def _view(words: Sequence[str]) -> None:
     running = serve.server(lambda push: page.render(show(push), served=True), options.port)
     sys.stdout.write(f"{serve.address(running, options.push)} (Ctrl-C ends it)\n")
     sys.stdout.flush()
-    # A shell lets what it starts in the background ignore Ctrl-C; a server must still end by it.
+    # A shell makes its background processes ignore Ctrl-C; SIGINT must still end the server.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with running, suppress(KeyboardInterrupt):
         running.serve_forever()
@@ -452,7 +476,7 @@ def _report(words: Sequence[str]) -> None:
 
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
-    parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago or sb3")
+    parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
     parser.add_argument("--quick", action="store_true", help="a minute, with larger ranges")
     options = parser.parse_args(words)
     from tsbench import bench

@@ -1,5 +1,5 @@
 """Hydra configuration: `task/NAME.yaml` and `method/NAME.yaml`, selected by `config.yaml`.
 
-Nothing here defines a task: its constants live in Python. YAML holds the selection, the budgets
-and the training settings.
+YAML does not define a task: its constants are in Python. It holds the selection, the budgets and
+the training settings.
 """

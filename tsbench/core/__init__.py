@@ -1,1 +1,1 @@
-"""What everyone may know: the words that tasks, learners and evaluations share."""
+"""The definitions that tasks, learners and evaluations share."""

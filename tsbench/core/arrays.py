@@ -1,7 +1,7 @@
-"""What functions need to run on arrays of any library: numpy here, torch on a GPU.
+"""Helpers for functions that run on arrays of any library: numpy here, torch on a GPU.
 
-Tasks are pure functions on the array API standard. Their constants have to follow the arrays that
-they meet: into the same library, data type and device.
+Tasks are pure functions on the array API standard. Their constants must have the library, data
+type and device of the arrays that they are combined with.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ Array = Any  # an array of any library that follows the array API standard
 
 
 def array_namespace(array: Array) -> Any:
-    """The functions of the array API standard, of the library that made `array`.
+    """The array API functions of the library that made `array`.
 
-    numpy keeps the standard itself. array_api_compat takes 12 us to say so, and its clip, for
-    instance, 49 us instead of 6: with some dozens of rockets that was a third of a step.
+    numpy implements the standard itself and is returned directly. array_api_compat needs 12 us for
+    the look-up, and its `clip` takes 49 us where numpy's takes 6 us. For some dozens of rockets
+    this overhead is a third of a step.
     """
     if type(array) is np.ndarray:
         return np
@@ -28,14 +29,14 @@ def array_namespace(array: Array) -> Any:
 
 
 def like(array: Array, constants: np.ndarray | tuple[Any, ...]) -> Array:
-    """Constants as `array` is: of its library, on its device, and floating-point numbers of its
-    data type. Integers and booleans stay what they are.
+    """Constants as an array in the library and on the device of `array`, shape as `constants`.
+    Floats get the data type of `array`; integers stay integers and booleans stay booleans.
 
-    Outside of numpy the copy is kept, so that a constant crosses to a device once.
+    Outside numpy the copy is cached, so that a constant is sent to a device only once.
 
     Args:
-        array: of floating-point numbers.
-        constants: numpy's array, not to be changed afterwards, or a tuple of floats.
+        array: floating-point numbers.
+        constants: a numpy array, which must not be changed afterwards, or a tuple of floats.
     """
     if isinstance(constants, tuple):
         if type(array) is np.ndarray:
@@ -52,7 +53,8 @@ def _place(array: Array) -> tuple[Any, Any, Any]:
 
 
 def filled(array: Array, shape: tuple[int, ...], value: float = 0.0) -> Array:
-    """An array as `array` is, of another shape, with one value everywhere."""
+    """An array of shape `shape` filled with `value`, of the library, data type and device of
+    `array`."""
     if type(array) is np.ndarray:
         return np.full(shape, value, array.dtype)
     xp, dtype, device = _place(array)
@@ -60,9 +62,9 @@ def filled(array: Array, shape: tuple[int, ...], value: float = 0.0) -> Array:
 
 
 def step_of(time: Array, timestep: float) -> Array:
-    """The number of the time step that lies at each time, an integer, shape as `time`.
+    """The number of the time step nearest to each time in seconds, integers, shape as `time`.
 
-    Times are sums of time steps, so that rounding leaves them a little beside.
+    Times are sums of time steps, so rounding errors leave them slightly off the exact multiple.
     """
     xp = array_namespace(time)
     return xp.astype(xp.round(time / timestep), xp.int64)
@@ -73,7 +75,8 @@ def _tuple_at(constants: tuple[Any, ...], xp: Any, dtype: Any, device: Any) -> A
     return xp.asarray(constants, dtype=dtype, device=device)
 
 
-# Copies of numpy's arrays, for as long as those live: by their identity, library, type and device.
+# Copies of numpy arrays, kept while the originals live. Keys: identity of the original; library,
+# data type and device of the copy.
 _copies: dict[tuple[Any, ...], Array] = {}
 
 

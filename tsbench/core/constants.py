@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-# Where a constant comes from, as docs/calibration.md and the task cards have it.
+# Sources of constants, by the letters that docs/calibration.md and the task cards use.
 SOURCES = {"P": "the paper", "D": "decided here", "C": "calibrated (docs/calibration.md)"}
 
 
@@ -14,9 +14,10 @@ def constant(value: Any, unit: str, source: str, meaning: str) -> Any:
 
     Args:
         value: a number, or a tuple of them.
-        unit: of it; "" where it has none.
-        source: letters of `SOURCES`: of the value, or of its form and then of its value.
-        meaning: in a few words.
+        unit: unit of the value; "" if it has none.
+        source: one or two letters of `SOURCES`. One letter is the source of the value. Two letters
+            are the source of the formula, then the source of the value.
+        meaning: what the constant means, in a few words.
     """
     assert set(source) <= SOURCES.keys(), source
     return dataclasses.field(

@@ -1,4 +1,4 @@
-"""What pictures of a task show beyond its model."""
+"""Things to draw in pictures of a task in addition to its MuJoCo model."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Flame:
-    """What an engine looks like while it works.
+    """The flame of a running engine.
 
     Attributes:
-        body: that carries it.
-        actuator: whose control makes it.
-        nozzle: where it begins, in the body's frame in metres.
-        direction: where it points to, in the body's frame, of length 1.
-        length: metres per unit of control; negative where negative controls make it.
+        body: name of the body that carries the engine.
+        actuator: name of the actuator whose control sets the length of the flame.
+        nozzle: start of the flame in the body's frame in metres.
+        direction: unit vector along the flame in the body's frame.
+        length: metres per unit of control; negative if the engine runs at negative controls.
     """
 
     body: str
@@ -29,17 +29,17 @@ class Flame:
 
 @dataclass(frozen=True)
 class Drawing:
-    """What pictures of a task show beyond its model.
+    """Things to draw in pictures of a task in addition to its MuJoCo model.
 
     Attributes:
-        feet: the geoms that are to touch the ground, each named as its foot.
-        contacts: seconds (...,) -> whether each foot is to be on the ground, (..., feet), or None
-            where nothing says so.
-        flames: of engines.
-        bounds: lowest and highest corner of the world in metres, where it has an edge. A flat
-            world has both at the same coordinate across it.
-        worth: positions (n, 3) -> the reward of a robot's being there (n,); drawn over a flat
-            world's bounds.
+        feet: names of the geoms that should touch the ground; each has the name of its foot.
+        contacts: the contact schedule: seconds (...,) -> whether each foot should be on the ground,
+            (..., feet). None without a schedule.
+        flames: flames of the engines.
+        bounds: lowest and highest corner of the world in metres; None for an unbounded world. In a
+            flat world both corners have the same coordinate along the normal of its plane.
+        worth: positions (n, 3) in metres -> reward of a robot at each position (n,); drawn within
+            the bounds of a flat world.
     """
 
     feet: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""What a user can get wrong, told in one line."""
+"""Errors that the user can correct, each told in one line."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import numpy as np
 
 
 class TsbenchError(Exception):
-    """A mistake that the user can mend.
+    """A mistake that the user can correct.
 
-    The message is one line in plain words, even where it quotes what has several. The command line
-    prints it after `tsbench: ` on the error stream and exits with status 2; no traceback is shown.
+    The message is one line in plain words, even if it quotes a text of several lines. The command
+    line prints it after `tsbench: ` on the error stream and exits with status 2; no traceback is
+    shown.
     """
 
     def __init__(self, message: str) -> None:
@@ -22,10 +23,10 @@ class TsbenchError(Exception):
 
 
 class NotFiniteError(TsbenchError):
-    """A number that is not finite has turned up: the computation has gone wrong.
+    """A computation has produced a number that is not finite.
 
     Attributes:
-        arrays: what it was computed from, by name, for whoever looks for the cause.
+        arrays: the inputs of the computation by name, for finding the cause.
     """
 
     def __init__(self, message: str, arrays: Mapping[str, np.ndarray]) -> None:
@@ -37,7 +38,7 @@ class Stopped(KeyboardInterrupt):
     """A signal has stopped the run: Ctrl-C, or SIGTERM.
 
     Attributes:
-        signal: its number. The exit status is 128 more, as a shell counts.
+        signal: number of the signal. The exit status is 128 plus this number, as in a shell.
     """
 
     def __init__(self, signal: int, message: str = "interrupted") -> None:
@@ -54,7 +55,7 @@ def unknown(
         kind: what was named, e.g. "task".
         given: the name given.
         allowed: the names that exist.
-        causes: why more names do not exist, a line each.
+        causes: reasons why further names are unavailable, one line each.
     """
     names = sorted(allowed)
     message = f"unknown {kind} '{given}'; allowed: {', '.join(names) or 'none'}"
@@ -65,10 +66,13 @@ def unknown(
 
 @contextmanager
 def os_errors(path: Path | str) -> Iterator[None]:
-    """Turns what the operating system refuses (disk full, no permission) into one line.
+    """Turns an `OSError` (disk full, no permission) into a `TsbenchError`.
 
     Args:
-        path: what is being read or written; named where the refusal names no file itself.
+        path: the file being read or written; the message names it if the error names no file.
+
+    Raises:
+        TsbenchError: the operating system has refused an operation within the context.
     """
     try:
         yield
@@ -80,17 +84,21 @@ _NO_MEMORY = (
     "allocate memory",
     "start new thread",
     "Resource temporarily unavailable",
-    "Caught an unknown exception!",  # mujoco's MjSpec, of a C++ bad_alloc
+    "Caught an unknown exception!",  # MjSpec of mujoco, for a C++ bad_alloc
 )
 
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turns a refusal of memory, by Python, numpy, mujoco or torch, into one line."""
+    """Turns an out-of-memory error of Python, numpy, mujoco or torch into a `TsbenchError`.
+
+    Raises:
+        TsbenchError: memory has run out within the context.
+    """
     try:
         yield
     except (MemoryError, RuntimeError, ValueError) as error:
-        # torch, and whoever cannot start a thread, raises a RuntimeError, mujoco a ValueError.
+        # torch and a thread that cannot start raise a RuntimeError, mujoco raises a ValueError.
         known = isinstance(error, MemoryError) or any(sign in str(error) for sign in _NO_MEMORY)
         if not known:
             raise

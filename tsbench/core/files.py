@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and never in the place of another."""
+"""Atomic writes, and writes that refuse to replace an existing file."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ PART = ".part"  # ends the name of a file that is being written
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file so that whoever reads it, even after a crash, finds all of it or none.
+    """Writes a file atomically: a reader finds all of it or nothing, even after a crash.
 
-    It is written beside its place, synced and renamed. A write that fails leaves nothing behind.
+    The content is written to a temporary file in the same folder, which is synced and then renamed.
+    An existing file is replaced. A failed write leaves no temporary file behind.
 
     Raises:
-        OSError: as the system says.
+        OSError: the operating system has refused the write. The error names `path`.
     """
     temporary = path.with_name(path.name + PART)
     try:
@@ -35,15 +36,15 @@ def write_whole(path: Path, content: bytes) -> None:
         with suppress(OSError):
             temporary.unlink()
         if isinstance(error, OSError):
-            error.filename, error.filename2 = str(path), None  # the one that the caller knows
+            error.filename, error.filename2 = str(path), None  # not the temporary file
         raise
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes what was renamed or removed in a folder last.
+    """Syncs a folder, so that renames and removals in it survive a crash.
 
     Raises:
-        OSError: as the system says.
+        OSError: the operating system has refused to open or sync the folder.
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -53,11 +54,11 @@ def sync_folder(folder: Path) -> None:
 
 
 def taken(place: Path, holds: str = "", way_out: str = "") -> TsbenchError:
-    """The error for a place that is taken: nothing is ever overwritten.
+    """The error for a path that is already in use.
 
     Args:
         place: a file or directory.
-        holds: what is in it, for a directory that exists and may hold nothing else.
+        holds: what the directory contains; "" to say only that the path exists.
         way_out: what the user can do instead.
     """
     state = f"holds {holds}" if holds else "exists"
@@ -66,11 +67,12 @@ def taken(place: Path, holds: str = "", way_out: str = "") -> TsbenchError:
 
 
 def check_new(path: Path, way_out: str = "", *, parents: bool = False) -> None:
-    """
+    """Checks that a new file or directory can be made.
+
     Args:
-        path: a file or directory to be made.
-        way_out: what the user can do where it exists.
-        parents: whether the folders above it will be made too.
+        path: the file or directory.
+        way_out: what the user can do instead if the path exists.
+        parents: whether the caller will also make the missing folders above it.
 
     Raises:
         TsbenchError: the path exists or cannot be made.
@@ -88,7 +90,7 @@ def check_new(path: Path, way_out: str = "", *, parents: bool = False) -> None:
 
 
 def write_new(path: Path, content: bytes) -> None:
-    """Writes a file where there is none.
+    """Writes a new file.
 
     Raises:
         TsbenchError: the file exists or cannot be written.
@@ -99,7 +101,7 @@ def write_new(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path | None, content: Any) -> None:
-    """Writes a new JSON file, if one is asked for.
+    """Writes a new JSON file, or nothing if `path` is None.
 
     Raises:
         TsbenchError: the file exists or cannot be written.

@@ -1,4 +1,4 @@
-"""What a method is given: a problem to solve, and a workspace to report to."""
+"""The arguments of a method: a problem to solve and a workspace to report to."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from tsbench.core.task import Task
 
 @dataclass(frozen=True)
 class Budget:
-    """How much a run may use.
+    """The environment steps that a run may use.
 
     Attributes:
         plan: environment steps of the planning variant.
         act: environment steps of the task or its imitation variant. A method without a planning
             stage may use both (paper: monolithic gets the sum).
-        environments: how many are stepped together at most, whatever the training settings say.
+        environments: limit on the environments stepped together, which overrides larger numbers in
+            the training settings; None for no limit.
     """
 
     plan: int
@@ -29,15 +30,15 @@ class Budget:
 
 @dataclass(frozen=True)
 class Problem:
-    """What a method has to solve, and with what.
+    """The task that a method has to learn, with its budget and settings.
 
     Attributes:
-        task: in full physics.
+        task: the task in full physics.
         budget: environment steps of each kind.
         training: changes to the PPO settings by kind of stage (a method's `STAGES`).
-        options: of the method, as its config has them.
-        seed: of all randomness.
-        threads: for the physics, or None for all cores.
+        options: the method's options as in its config.
+        seed: seed of all random numbers.
+        threads: number of threads for the physics, or None for all cores.
     """
 
     task: Task[Any]
@@ -48,16 +49,16 @@ class Problem:
     threads: int | None
 
 
-Snapshot = Mapping[str, Any]  # nested mappings of numpy arrays and of what JSON can hold
+Snapshot = Mapping[str, Any]  # nested mappings of numpy arrays and JSON values
 
 
 class Monitor(Protocol):
-    """Takes a stage's figures, once per iteration.
+    """Receives the metrics of a stage, once per iteration.
 
     Attributes:
-        physics_substeps: steps of the physics so far.
-        warnings: how often mujoco has warned so far, by mujoco's names.
-        saved: the newest snapshot of this stage where a run is resumed, else None.
+        physics_substeps: physics steps so far.
+        warnings: number of mujoco warnings so far, by mujoco's name of their kind.
+        saved: the newest snapshot of this stage if the run is resumed, else None.
     """
 
     physics_substeps: int
@@ -72,29 +73,29 @@ class Monitor(Protocol):
         metrics: Mapping[str, float],
         snapshot: Callable[[], Snapshot] | None = None,
     ) -> None:
-        """Takes an iteration's figures, and what to go on from should the run be interrupted.
+        """Receives the metrics of an iteration and a function that makes a checkpoint.
 
         Args:
             steps: environment steps of this stage so far.
             metrics: named scalars.
-            snapshot: gives all that the stage's next iteration depends on. It is called now and
-                then. A stage without one is done again when a run is resumed.
+            snapshot: returns everything that the stage's next iteration depends on. The monitor
+                calls it from time to time. A stage without it starts again when a run is resumed.
         """
 
 
 class Workspace(Protocol):
-    """Where a method reports and leaves what it makes.
+    """The place where a method reports its progress and saves its results.
 
-    When a run is resumed, the method is called again from the top. Its stages get back what they
-    had `saved`, those that were finished their last state; what lies between them is done again,
-    so it must depend on nothing but the problem and the stages before.
+    When a run is resumed, the method is called again from its beginning. Each stage finds its
+    newest snapshot in `Monitor.saved`; the snapshot of a finished stage is its last state. Code
+    between stages runs again, so it may depend only on the problem and on earlier stages.
     """
 
     @property
     def directory(self) -> Path: ...
 
     def stage(self, name: str, steps: int) -> AbstractContextManager[Monitor]:
-        """A stage that may use that many environment steps."""
+        """A context for a stage of at most `steps` environment steps; it yields the monitor."""
 
     def note(self, line: str) -> None:
-        """Tells the user something in plain words."""
+        """Shows the user one line of text."""

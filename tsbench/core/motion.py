@@ -1,4 +1,4 @@
-"""Plans and reference motions: what passes from the planning stage to the imitation stage."""
+"""Plans and reference motions, which the planning stage passes to the imitation stage."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from tsbench.core.arrays import Array, array_namespace, step_of
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_whole
 
-# What numpy and zipfile raise on files that are not what they should be. RuntimeError covers
-# encrypted members and unknown compression methods.
+# Exceptions that numpy and zipfile raise for damaged files. RuntimeError covers encrypted members
+# and unknown compression methods.
 _DAMAGE = (
     OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, MemoryError, OverflowError,
     zlib.error, zipfile.BadZipFile, struct.error,
 )  # fmt: skip
 
 
-_ORIGIN = ("task", "task_version", "timestep")  # what every recording says of itself
+_ORIGIN = ("task", "task_version", "timestep")  # fields of every recording
 
 
 @dataclass(frozen=True)
 class _Recording:
-    """Arrays over time with their origin, kept in one npz file that holds no code."""
+    """Arrays over time and their origin, saved in one npz file that contains no pickled code."""
 
     kind: ClassVar[str]
-    dimensions: ClassVar[dict[str, int]]  # of each array, by its name
+    dimensions: ClassVar[dict[str, int]]  # number of axes of each array
 
     task: str
     task_version: int
@@ -64,17 +64,21 @@ class _Recording:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """All of its arrays by name, time as their first axis."""
+        """All arrays by name; their first axis is time."""
         return {name: getattr(self, name) for name in self.dimensions}
 
     def save(self, path: Path | str) -> None:
-        """Writes the recording; the file appears whole or not at all."""
+        """Writes the recording to a file, atomically (see `write_whole`).
+
+        Raises:
+            OSError: the file cannot be written.
+        """
         content = io.BytesIO()
         np.savez_compressed(content, allow_pickle=False, kind=self.kind, **self._content())
         write_whole(Path(path), content.getvalue())
 
     def _content(self) -> dict[str, Any]:
-        """What the file holds, by name."""
+        """The content of the file by name."""
         return {**{name: getattr(self, name) for name in _ORIGIN}, **self.arrays}
 
     @classmethod
@@ -95,7 +99,8 @@ class _Recording:
 
     @classmethod
     def _from_content(cls, content: dict[str, Any]) -> Self:
-        """
+        """The recording with the content of a file.
+
         Raises:
             TsbenchError: values are missing, unknown or wrong.
         """
@@ -162,8 +167,8 @@ class ReferenceMotion(_Recording):
     Attributes:
         qpos: generalised positions, shape (T + 1, nq).
         qvel: generalised velocities by central differences, shape (T + 1, nv).
-        tracked: what else the task's imitation reward compares, by name, each (T + 1, ...), of
-            numbers or booleans (`Plannable.tracked`).
+        tracked: further arrays that the task's imitation reward compares, by name, each of shape
+            (T + 1, ...), float64 or bool (`Plannable.tracked`).
     """
 
     kind: ClassVar[str] = "reference motion"
@@ -218,7 +223,8 @@ class ReferenceMotion(_Recording):
         return np.arange(self.steps + 1) * self.timestep
 
     def frame(self, time: Array) -> Array:
-        """Index of the frame at each time in seconds; the last one beyond the end."""
+        """Index of the frame nearest to each time in seconds, shape as `time`; the last frame for
+        later times."""
         return array_namespace(time).clip(step_of(time, self.timestep), 0, self.steps)
 
 
@@ -234,11 +240,11 @@ def read_motion(path: Path | str) -> Plan | ReferenceMotion:
 
 @dataclass(frozen=True)
 class ActionLog(_Recording):
-    """What a policy did in some episodes, to replay their physics from.
+    """The actions and rewards of some episodes, from which their physics can be replayed.
 
     Attributes:
-        actions: of the nominal and then the perturbed episodes, shape (T, n, action_size).
-        rewards: that they earned, shape (T, n); zero once an episode has ended.
+        actions: actions of the nominal, then of the perturbed episodes, shape (T, n, action_size).
+        rewards: reward of each step, shape (T, n); zero after the end of an episode.
     """
 
     kind: ClassVar[str] = "action log"
@@ -257,7 +263,7 @@ class ActionLog(_Recording):
 
 @dataclass(frozen=True)
 class AuditItem:
-    """One measured property of a plan or reference motion against what is allowed."""
+    """One measured property of a plan or reference motion, and its largest allowed value."""
 
     what: str
     value: float
@@ -275,7 +281,7 @@ class AuditItem:
 
 @dataclass(frozen=True)
 class Audit:
-    """Whether a plan can be followed at all, in plain words."""
+    """Measured properties that tell whether physics can follow a plan."""
 
     items: tuple[AuditItem, ...]
 

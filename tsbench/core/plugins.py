@@ -8,7 +8,7 @@ cart = "cart_package.task"  # registers tasks under names of its own choice
 [project.entry-points."tsbench.methods"]
 lazy = "cart_package.lazy"  # is the method `lazy`
 
-Its package has, as tsbench has, the files `conf/task/TASK.yaml`, `conf/method/METHOD.yaml` and
+Like tsbench, its package contains the files `conf/task/TASK.yaml`, `conf/method/METHOD.yaml` and
 `models/MODEL.xml`. A plug-in that cannot be imported is refused in one line; the others work.
 """
 
@@ -76,11 +76,11 @@ class Provider:
 
     @contextmanager
     def explained(self) -> Iterator[None]:
-        """Turns whatever goes wrong in a plug-in's code into one line that names the plug-in."""
+        """Turns any exception of a plug-in's code into a `TsbenchError` that names the plug-in."""
         try:
             yield
         except Exception as error:
-            if self.package == OWN:  # no mistake of the user's
+            if self.package == OWN:  # a defect of tsbench, which needs its traceback
                 raise
             reason = f"{type(error).__name__}: {error}"
             raise TsbenchError(f"the plug-in {self} cannot be used: {reason}") from error
@@ -91,9 +91,9 @@ class Plugin:
     """An entry point of a plug-in.
 
     Attributes:
-        name: of the entry point.
-        module: that it names.
-        provider: whose it is.
+        name: name of the entry point.
+        module: name of the module that the entry point refers to.
+        provider: the package that brings the entry point.
     """
 
     name: str
@@ -101,10 +101,10 @@ class Plugin:
     provider: Provider
 
     def find(self) -> None:
-        """Looks for the module, and imports no more than the packages around it.
+        """Checks that the module exists. Imports only the packages that contain it.
 
         Raises:
-            TsbenchError: it is not there, or a package around it cannot be imported.
+            TsbenchError: the module does not exist, or a containing package cannot be imported.
         """
         self.provider.folder()
         with self.provider.explained():
@@ -115,7 +115,7 @@ class Plugin:
         """Imports the module.
 
         Raises:
-            TsbenchError: it cannot be imported.
+            TsbenchError: the module cannot be imported.
         """
         with self.provider.explained():
             return importlib.import_module(self.module)
@@ -123,7 +123,7 @@ class Plugin:
 
 @cache
 def plugins(group: str) -> tuple[Plugin, ...]:
-    """The entry points of a group (`TASKS` or `METHODS`) of all installed packages, in order."""
+    """The entry points of a group (`TASKS` or `METHODS`) of all installed packages, sorted."""
     found = []
     for point in entry_points(group=group):
         module = point.value.partition(":")[0].strip()
@@ -144,7 +144,7 @@ def own() -> Provider:
 
 
 def providers() -> tuple[Provider, ...]:
-    """tsbench itself, and every plug-in."""
+    """tsbench itself, then every plug-in in order."""
     return own(), *sorted({plugin.provider for plugin in plugins(TASKS) + plugins(METHODS)})
 
 
@@ -163,10 +163,10 @@ def configurations(group: str = "") -> Iterator[Traversable]:
     """The configuration folder of every package that has one, tsbench's first.
 
     Args:
-        group: "task" or "method", for the folders within.
+        group: "task" or "method" for that subfolder; "" for the whole folder.
     """
     for provider in providers():
-        with suppress(TsbenchError):  # `broken` tells of it
+        with suppress(TsbenchError):  # `broken` reports it
             folder = provider.folder() / "conf"
             if (found := folder / group if group else folder).is_dir():
                 yield found
@@ -176,9 +176,9 @@ def ambiguous(kind: str, name: str, packages: Iterable[str]) -> TsbenchError:
     """The error for a name that several packages bring.
 
     Args:
-        kind: of what is named, e.g. "task".
+        kind: kind of the named thing, e.g. "task".
         name: the name.
-        packages: that bring it.
+        packages: the packages that bring it.
     """
     known = {provider.package: str(provider) for provider in providers()}
     brought = " and by ".join(known.get(package, package) for package in sorted(packages))
@@ -186,7 +186,7 @@ def ambiguous(kind: str, name: str, packages: Iterable[str]) -> TsbenchError:
 
 
 def walk(folder: Traversable, path: str = "") -> Iterator[tuple[str, Traversable]]:
-    """All files below a folder, by their path in it; none where there is no such folder."""
+    """All files below a folder, by their paths relative to it; none if there is no such folder."""
     for entry in folder.iterdir() if folder.is_dir() else ():
         if entry.is_dir():
             yield from walk(entry, f"{path}{entry.name}/")

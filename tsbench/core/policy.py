@@ -1,7 +1,7 @@
-"""The policy artefact: data that a short numpy forward pass turns into actions.
+"""The policy artefact: the weights of a network as data, and its forward pass in numpy.
 
-`policy.safetensors` holds the weights, `policy.json` says what they mean. Neither can execute
-code, and running them needs no torch.
+`policy.safetensors` holds the weights, `policy.json` describes them. Loading them executes no code
+from the files, and running the policy needs no torch.
 """
 
 from __future__ import annotations
@@ -46,26 +46,26 @@ def _symlog(x: np.ndarray) -> np.ndarray:
     return np.sign(x) * np.log1p(np.abs(x))
 
 
-# What is done to observations before they are normalised. Where some range over tens of metres and
-# decimetres still matter, as a rocket's way to its goal, `symlog` (Hafner et al. 2023, DreamerV3)
-# spreads the small values apart.
+# Applied to observations before they are normalised. `symlog` (Hafner et al. 2023, DreamerV3)
+# compresses large values and keeps small ones apart. This helps where an observation ranges over
+# tens of metres but decimetres matter, such as a rocket's offset from its goal.
 ENCODINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"plain": _plain, "symlog": _symlog}
 
 
 @dataclass(frozen=True)
 class PolicyInfo:
-    """What `policy.json` says.
+    """The content of `policy.json`.
 
     Attributes:
-        task: name of the task it was trained for.
-        task_version: of that task.
+        task: name of the task that the policy was trained for.
+        task_version: version of that task.
         physics: fingerprint of the task's MJCF (`sim.model.fingerprint`).
-        method: what trained it.
-        activation: between layers, a name in `ACTIVATIONS`.
-        layers: sizes from observation to action.
-        sha256: of `policy.safetensors`.
-        encoding: of observations before they are normalised, a name in `ENCODINGS`.
-        format: of these files.
+        method: name of the method that trained the policy.
+        activation: activation of the hidden layers, a name in `ACTIVATIONS`.
+        layers: sizes of the layers from observation to action.
+        sha256: hash of `policy.safetensors`.
+        encoding: encoding of observations before normalisation, a name in `ENCODINGS`.
+        format: version of the file format.
     """
 
     task: str
@@ -84,11 +84,11 @@ class Policy:
     """A multilayer perceptron with its observation normaliser: observation -> action.
 
     Attributes:
-        info: where it comes from.
-        mean: of the encoded observations in training, shape (n,), float32.
-        scale: what deviations from the mean are divided by, shape (n,), float32.
-        weights: of each layer, shape (outputs, inputs), float32.
-        biases: of each layer, shape (outputs,), float32.
+        info: origin of the policy and layout of the network.
+        mean: mean of the encoded observations in training, shape (n,), float32.
+        scale: divisor of deviations from the mean, shape (n,), float32.
+        weights: one array for each layer, shape (outputs, inputs), float32.
+        biases: one array for each layer, shape (outputs,), float32.
     """
 
     info: PolicyInfo
@@ -98,23 +98,23 @@ class Policy:
     biases: tuple[np.ndarray, ...]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (..., m) in [-1, 1] for observations (..., n), deterministic.
+        """Deterministic actions (..., m) in [-1, 1], float64, for observations (..., n).
 
-        Each row is computed by itself: matrix products over several rows round differently, and
-        an action must not depend on what else is in the batch.
+        Each row is computed on its own: matrix products over several rows round differently, and
+        an action must not depend on the other rows of the batch.
         """
         activation = ACTIVATIONS[self.info.activation]
         encoded = ENCODINGS[self.info.encoding](np.asarray(observation, np.float32))
         x = (encoded - self.mean) / self.scale
         last = len(self.weights) - 1
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = (weight @ x[..., None])[..., 0] + bias  # a product of its own for every row
+            x = (weight @ x[..., None])[..., 0] + bias  # one matrix-vector product per row
             if i < last:
                 x = activation(x)
         return np.clip(x, -1.0, 1.0).astype(np.float64)
 
     def _content(self) -> bytes:
-        """Of `policy.safetensors`."""
+        """The bytes of `policy.safetensors`."""
         tensors = {"mean": self.mean, "scale": self.scale}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             tensors[f"weight_{i}"] = np.ascontiguousarray(weight)
@@ -123,11 +123,15 @@ class Policy:
 
     @property
     def sha256(self) -> str:
-        """Of `policy.safetensors`, saved or not."""
+        """Hash of `policy.safetensors`, whether saved or not."""
         return hashlib.sha256(self._content()).hexdigest()
 
     def save(self, directory: Path | str) -> None:
-        """Writes policy.safetensors and policy.json into the directory."""
+        """Writes policy.safetensors and policy.json into the directory.
+
+        Raises:
+            OSError: a file cannot be written.
+        """
         directory = Path(directory)
         content = self._content()
         info = asdict(self.info) | {"sha256": hashlib.sha256(content).hexdigest()}
@@ -136,10 +140,10 @@ class Policy:
 
     @classmethod
     def load(cls, directory: Path | str) -> Policy:
-        """Reads what `save` wrote.
+        """Reads a policy that `save` has written.
 
         Raises:
-            TsbenchError: a file is missing or damaged, or they do not belong together.
+            TsbenchError: a file is missing or damaged, or the files do not belong together.
         """
         directory = Path(directory)
         info = _read_info(directory / "policy.json")

@@ -28,13 +28,15 @@ def angle_between(p: Array, q: Array) -> Array:
 
 
 def upward(orientation: Array) -> Array:
-    """z component of the body's own z axis: 1 upright, negative past a tilt of 90 degrees."""
+    """World z component of the body's z axis, shape (...,): 1 if upright, negative beyond a tilt of
+    90 degrees."""
     x, y = orientation[..., 1], orientation[..., 2]
     return 1.0 - 2.0 * (x * x + y * y)
 
 
 def to_heading(vectors: Array, orientation: Array) -> Array:
-    """World-frame vectors (..., n, 3) in the frame turned by the body's yaw about z."""
+    """World-frame vectors (..., n, 3) in the heading frame, which is the world frame turned about z
+    by the body's yaw."""
     xp = array_namespace(vectors)
     w, x, y, z = (orientation[..., i] for i in range(4))
     yaw = xp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))[..., None]

@@ -75,10 +75,10 @@ class Course(Batch):
 
 @dataclass(frozen=True)
 class Start:
-    """Where episodes begin.
+    """The initial states of episodes.
 
     Attributes:
-        time: seconds, shape (n,). Zero but in training that starts along a reference motion.
+        time: seconds, shape (n,). Zero, except in training that starts along a reference motion.
         qpos: generalised positions, shape (n, nq).
         qvel: generalised velocities, shape (n, nv).
         memory: what `Plant.control` remembers, shape (n, m).
@@ -102,14 +102,14 @@ class Start:
 
 @dataclass(frozen=True)
 class Readings:
-    """What the physics tells the task after a control step.
+    """The quantities that a task reads from the physics after a control step.
 
     Attributes:
         time: seconds since the start of the episode, shape (...,).
         qpos: generalised positions, shape (..., nq).
         qvel: generalised velocities, shape (..., nv).
-        sensors: the MJCF's sensors by name, each (..., dim), current at qpos and qvel. Only
-            position and velocity sensors are: those of the acceleration stage lag a substep.
+        sensors: values of the MJCF's sensors by name, each (..., dim). Position and velocity
+            sensors are current at qpos and qvel; acceleration sensors lag by one substep.
         memory: what `Plant.control` remembers, shape (..., m).
     """
 

@@ -1,8 +1,8 @@
-"""What a task must say.
+"""The interfaces that tasks implement.
 
 Four interfaces, each of which adds to the one before:
 
-- `MDP`: observations, rewards and endings of states, whatever steps them.
+- `MDP`: observations, rewards and endings as functions of states, independent of the dynamics.
 - `SimulatedTask`: an MDP that is stepped in full physics, by the `Plant` that it names.
 - `Task`: that can be scored: what success is, what else to measure, when to push, which motion is
   the best known.
@@ -10,8 +10,8 @@ Four interfaces, each of which adds to the one before:
 
 A new task is one class that implements `Task` or `Plannable`. Everything here is pure functions
 over arrays whose leading axes are batch axes, written on the array API standard, so that one
-environment, thousands stepped together and a GPU run the same code. Nothing remembers anything
-between calls: memory across time steps is an explicit field of the state.
+environment, thousands stepped together and a GPU run the same code. No function keeps data between
+calls: memory across time steps is an explicit field of the state.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ Vector = tuple[float, float, float]
 
 
 class MDP(ABC, Generic[S]):
-    """States to observations, rewards and endings. Shared by a task and its variants.
+    """Observations, rewards and endings of states. Shared by a task and its variants.
 
     Attributes:
         name: of the task.
-        version: of the task; whatever can change a score raises it.
+        version: version of the task; any change that can affect a score raises it.
         horizon: time steps in an episode.
         timestep: seconds between actions.
         observation_size: dimensions of an observation.
@@ -56,10 +56,11 @@ class MDP(ABC, Generic[S]):
 
     @abstractmethod
     def observation(self, state: S) -> Array:
-        """Shape (..., observation_size)."""
+        """The observation, shape (..., observation_size)."""
 
     def value_observation(self, state: S) -> Array:
-        """What a critic sees, which only helps to learn and is free to know more, (..., any)."""
+        """The critic's observation, shape (..., any). Only training uses the critic, so it may see
+        more than the policy."""
         return self.observation(state)
 
     @abstractmethod
@@ -71,8 +72,8 @@ class MDP(ABC, Generic[S]):
         """Whether the episode ends here for a reason other than its last step, shape (...,)."""
 
     def reward_terms(self, previous: S, action: Array, state: S) -> dict[str, Array]:
-        """What the reward is made of, by name, each of shape (...,), for people to look at. How
-        the terms combine is each task's own; by default there is only the reward itself."""
+        """The terms of the reward by name, each of shape (...,), for display. Each task combines
+        its terms in its own way; by default the only term is the reward."""
         return {"reward": self.reward(previous, action, state)}
 
     def reached(self, state: S) -> Array:
@@ -127,14 +128,16 @@ class MDP(ABC, Generic[S]):
 
 
 class Plant(ABC, Generic[S]):
-    """What MuJoCo steps: a model, what actions do to its actuators, what its sensors mean.
+    """The system that MuJoCo steps: a model, the effect of actions on its actuators, and the state
+    that its sensors measure.
 
     Attributes:
         timestep: seconds between actions.
         substeps: physics steps in one control step.
         action_size: dimensions of an action, which lies in the box [-1, 1].
         pushed: the body that pushes act on, at its centre of mass.
-        push_plane: two axes of the world. A push has a heading from the first to the second.
+        push_plane: two axes of the world. The heading of a push is the angle from the first axis
+            towards the second.
     """
 
     timestep: float
@@ -145,22 +148,23 @@ class Plant(ABC, Generic[S]):
 
     @abstractmethod
     def spec(self) -> mujoco.MjSpec:
-        """The model, with goal and obstacles in it."""
+        """The model, with goal and obstacles in it. The viewer frames and labels what is named
+        `goal` (a site) and `obstacle_1`, `obstacle_2`, ... (spheres)."""
 
     @abstractmethod
     def control(self, state: S, action: Array) -> tuple[Array, Array]:
-        """Actuator controls (..., nu) for an action, and what to remember (..., m)."""
+        """Actuator controls (..., nu) for an action, and the memory (..., m) for the next state."""
 
     @abstractmethod
     def read(self, readings: Readings) -> S:
-        """The task's state from what the physics tells."""
+        """The task's state from the readings of the physics."""
 
     def memory(self, state: S) -> Array:
-        """What `control` remembered on the way to a state, shape (..., m); by default nothing."""
+        """The memory that `control` returned for a state, shape (..., m); by default none."""
         return state.time[..., None][..., :0]
 
     def drawing(self) -> Drawing:
-        """What pictures show beyond the model."""
+        """Things to draw in addition to the model."""
         return Drawing()
 
 
@@ -168,7 +172,7 @@ class SimulatedTask(MDP[S]):
     """An MDP in full physics: a task, or a variant of one with the same plant.
 
     Attributes:
-        plant: what steps it.
+        plant: the system that MuJoCo steps.
     """
 
     @property
@@ -241,23 +245,23 @@ class Task(SimulatedTask[S], Plant[S]):
     @abstractmethod
     def ideal(self) -> S:
         """The states of the best motion known under the task's speed limits, one per control
-        step from the start, time as the batch axis (horizon + 1). Physics does not bind it."""
+        step from the start, time as the batch axis (horizon + 1). Physics need not allow it."""
 
     @abstractmethod
     def constants(self) -> Mapping[str, Any]:
         """Every value that decides a score and does not stand in the MJCF, by name: numbers,
-        strings, and lists or mappings of them. A score made with other values is not comparable,
-        so that values which only matter to a learner stay out."""
+        strings, and lists or mappings of them. Scores made with different values are not
+        comparable, so values that matter only to a learner are left out."""
 
 
 class Abstraction(ABC, Generic[S]):
-    """A task's kinematic view, in which one samples states instead of actions.
+    """The kinematics of a task's planning variant, in which an action is a change of the state.
 
     Attributes:
         timestep: seconds between plan states.
         horizon: plan steps in an episode.
         action_size: dimensions of an action; each lies in [-1, 1].
-        observation_size: dimensions of what the planner sees.
+        observation_size: dimensions of the planner's observation.
         coordinates: names of the abstract coordinates that a plan stores.
     """
 
@@ -273,7 +277,7 @@ class Abstraction(ABC, Generic[S]):
 
     @abstractmethod
     def sample(self, rng: Rng, count: int) -> S:
-        """`count` states from anywhere that a plan could pass."""
+        """`count` random states from the region that plans can pass through."""
 
     @abstractmethod
     def advance(self, state: S, action: Array) -> S:
@@ -281,10 +285,10 @@ class Abstraction(ABC, Generic[S]):
 
     @abstractmethod
     def observation(self, state: S) -> Array:
-        """What the planner sees, shape (..., observation_size)."""
+        """The planner's observation, shape (..., observation_size)."""
 
     def value_observation(self, state: S) -> Array:
-        """What the planner's critic sees, which is free to know more, (..., any)."""
+        """The observation of the planner's critic, which may see more, shape (..., any)."""
         return self.observation(state)
 
     def dynamics_reward(self, state: S) -> Array:
@@ -298,7 +302,7 @@ class Abstraction(ABC, Generic[S]):
 
     @abstractmethod
     def naive(self, state: S) -> Array:
-        """The action of a planner made by hand, which learned plans should beat."""
+        """The action of a hand-made planner, a baseline for learned plans, (..., action_size)."""
 
     @abstractmethod
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
@@ -306,7 +310,7 @@ class Abstraction(ABC, Generic[S]):
 
 
 class Tracker(ABC, Generic[S]):
-    """What the imitation variant replaces in a task, given a reference motion.
+    """The reward, ending and start of a task's imitation variant, given a reference motion.
 
     Attributes:
         max_reward: the largest reward of a time step.
@@ -334,8 +338,8 @@ class Plannable(Task[S]):
 
     Attributes:
         imitation_forms: tracking rewards on offer, the default first.
-        tracked: what a reference motion of the task holds beside poses and velocities, by name,
-            each with its shape in one frame.
+        tracked: arrays that a reference motion of the task has besides poses and velocities, by
+            name, each with its shape in one frame.
     """
 
     imitation_forms: tuple[str, ...]
@@ -351,17 +355,17 @@ class Plannable(Task[S]):
 
     @abstractmethod
     def audit(self, plan: Plan, reference: ReferenceMotion) -> Audit:
-        """Whether the physics could follow the plan."""
+        """Measures whether physics can follow the plan."""
 
     @abstractmethod
     def tracker(self, reference: ReferenceMotion, form: str | None = None) -> Tracker[S]:
         """The imitation variant's reward; `form` picks one of `imitation_forms`."""
 
     def imitation_form(self, form: str | None) -> str:
-        """The tracking reward of that name, None for the default.
+        """The name of a tracking reward; None stands for the default.
 
         Raises:
-            TsbenchError: there is none of that name.
+            TsbenchError: the task has no tracking reward of that name.
         """
         if form is None:
             return self.imitation_forms[0]
@@ -370,9 +374,10 @@ class Plannable(Task[S]):
         return form
 
     def check_fit(self, motion: Plan | ReferenceMotion) -> None:
-        """
+        """Checks that a plan or reference motion belongs to this task.
+
         Raises:
-            TsbenchError: the motion is for another task or version of it, or has other sizes.
+            TsbenchError: the motion is for another task or version, or its arrays have other sizes.
         """
         if (motion.task, motion.task_version) != (self.name, self.version):
             raise TsbenchError(
@@ -397,10 +402,10 @@ class Plannable(Task[S]):
 
 
 def plannable(task: MDP[S]) -> Plannable[S]:
-    """The task, as one with a planning variant.
+    """The same task, typed as one with a planning variant.
 
     Raises:
-        TsbenchError: it has none.
+        TsbenchError: the task has no planning variant.
     """
     if not isinstance(task, Plannable):
         raise TsbenchError(f"{task.name} has no planning variant, which this needs")

@@ -1,4 +1,4 @@
-"""Plain values, as YAML and JSON give them, into dataclasses."""
+"""Checked conversion of plain YAML and JSON values to dataclasses."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from tsbench.core.errors import TsbenchError, unknown
 
 
 def typed(kind: Any, value: Any, path: str) -> Any:
-    """A plain value as a dataclass, container or scalar of the type asked for.
+    """Converts a plain value to a dataclass, container or scalar of type `kind`.
 
-    Numbers are never rounded, nor text read as numbers; a whole number is a valid float.
+    Numbers are never rounded, and text is never read as a number. A whole number is a valid float.
 
     Args:
         kind: a type annotation.
-        value: what YAML or JSON gave.
+        value: a value from YAML or JSON.
         path: the dotted key, for messages.
 
     Raises:
@@ -51,7 +51,11 @@ def typed(kind: Any, value: Any, path: str) -> Any:
 
 
 def typed_items(kind: type, value: Any, path: str) -> dict[str, Any]:
-    """Those fields of a dataclass that are given, with their types. See `typed`."""
+    """Converts the given fields of a dataclass; missing ones are left out. See `typed`.
+
+    Raises:
+        TsbenchError: a key is unknown, or a value has the wrong type or range.
+    """
     if not isinstance(value, Mapping):
         raise TsbenchError(f"{path or 'the content'} must be key: value pairs, not {value!r}")
     hints = get_type_hints(kind)

@@ -1,4 +1,4 @@
-"""Figures in words."""
+"""Durations and numbers as text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def duration(seconds: float) -> str:
 
 
 def number(value: Any) -> str:
-    """Four digits of a fraction; a dash for what is not known."""
+    """A number as text: a float with four significant digits; a dash for None, infinity or NaN."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

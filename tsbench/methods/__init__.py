@@ -1,8 +1,8 @@
 """The methods. A new one is one file here and one config in conf/method/.
 
 `tsbench.methods.NAME` has a dataclass `Options` and a function
-`train(problem, workspace) -> Policy`; with PPO stages it names their kinds in `STAGES`. Both files
-may also lie in another package (see `tsbench.core.plugins`).
+`train(problem, workspace) -> Policy`. A method with PPO stages lists their kinds in `STAGES`. Both
+files may also lie in another package (see `tsbench.core.plugins`).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def find(name: str) -> Method:
     """The method of that name.
 
     Raises:
-        TsbenchError: there is none, it cannot be imported, or it lacks a part.
+        TsbenchError: no such method, or the method cannot be imported or lacks a part.
     """
     module = _plugin(name).load()
     for part in ("Options", "train"):
@@ -98,7 +98,7 @@ def stages(name: str) -> tuple[str, ...]:
 
 
 def all_stages() -> set[str]:
-    """The kinds of PPO stages of all methods but those that cannot be imported."""
+    """The kinds of PPO stages of all methods that can be imported."""
     kinds: set[str] = set()
     for name in names():
         with suppress(TsbenchError):
@@ -118,7 +118,7 @@ def options(kind: type[Any], problem: Problem) -> Any:
 
 @cache
 def _found() -> tuple[dict[str, dict[str, Plugin]], tuple[str, ...]]:
-    """Where methods are: by name and by the package that brings each. And a line for each plug-in
+    """The methods, by name and then by the package that brings them, and a line for each plug-in
     that cannot be imported."""
     own = [
         Plugin(module.name, f"{__name__}.{module.name}", plugins.own())

@@ -14,7 +14,7 @@ STAGES = ("task",)
 
 @dataclass(frozen=True)
 class Options:
-    """There are none: the PPO settings are the task's (`task.training.task`)."""
+    """The method has no options: its PPO settings are the task's (`task.training.task`)."""
 
 
 def train(problem: Problem, workspace: Workspace) -> Policy:

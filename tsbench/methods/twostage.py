@@ -1,8 +1,9 @@
 """Two stages (the paper): plan in kinematics, then imitate the plan in full physics.
 
-Stage one learns on the planning variant by PPO; its deterministic rollout is the plan. The plan is
-audited and turned into a reference motion. Stage two learns to imitate that by PPO. A third stage,
-off by default, fine-tunes the imitation policy on the task's own reward.
+Stage one learns on the planning variant by PPO; the deterministic rollout of its policy is the
+plan. The plan is audited and turned into a reference motion. Stage two learns to imitate the
+reference motion by PPO. A third stage, off by default, fine-tunes the imitation policy on the
+task's own reward.
 """
 
 from __future__ import annotations

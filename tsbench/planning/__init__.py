@@ -1,1 +1,1 @@
-"""From abstract states to poses, and planners that do not learn."""
+"""Geometry of plans: gaits, paths, and inverse kinematics from abstract states to poses."""

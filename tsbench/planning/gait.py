@@ -1,4 +1,4 @@
-"""Gaits: which foot stands when, and how it moves from one stance to the next."""
+"""Gaits: contact schedules, and the motion of a foot from one stance to the next."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import numpy as np
 
 from tsbench.core.arrays import Array, like
 
-# Share of a cycle by which an instant may miss a touchdown or lift-off and still be at it: more
-# than the rounding of single precision after some cycles, far less than a control step.
+# Share of a cycle within which a time counts as a touchdown or lift-off. It exceeds the rounding of
+# single precision after some cycles and is far smaller than a control step.
 SLACK = 1e-5
 
 
 @dataclass(frozen=True)
 class Gait:
-    """A contact schedule that depends on the clock alone, with the speeds that go with it.
+    """A contact schedule that depends on time alone, and the speed limits of the robot.
 
     Attributes:
         period: seconds of a cycle.
         duty: share of the cycle in which a foot is on the ground.
         phases: share of the cycle by which each foot is ahead of the clock.
-        base_speed: m/s at most.
-        foot_speed: rad/s at most about the hip.
-        leg_length: metres, of the arc a foot moves on. With speed * duty / (1 - duty) =
-            foot_speed * leg_length both speeds are reached together.
+        base_speed: largest speed of the base in m/s.
+        foot_speed: largest angular speed of a foot about its hip in rad/s.
+        leg_length: radius in metres of the arc that a foot moves on. If base_speed * duty /
+            (1 - duty) = foot_speed * leg_length, base and feet reach their limits together.
     """
 
     period: float
@@ -39,12 +39,13 @@ class Gait:
     def phase(self, time: Array, slack: float = 1e-9) -> Array:
         """Each foot's share of the cycle since its touchdown, in [0, 1), shape (..., feet).
 
-        `slack` keeps an instant that rounding moved below a whole cycle from ending it.
+        `slack`, a share of a cycle, makes up for rounding that puts a touchdown just before the end
+        of the previous cycle.
         """
         return (time[..., None] / self.period + like(time, self.phases) + slack) % 1.0
 
     def contacts(self, time: Array) -> Array:
-        """Whether each foot is to be on the ground, shape (..., feet).
+        """Whether each foot should be on the ground, shape (..., feet).
 
         A stance is half open: the foot is on the ground at touchdown, and at lift-off no longer.
         """
@@ -53,19 +54,19 @@ class Gait:
     def swung(
         self, plan_times: np.ndarray, planned: np.ndarray, times: np.ndarray, height: float
     ) -> np.ndarray:
-        """Feet that stand still in stance and swing in half sines, after planned ones.
+        """Foot positions that follow a plan, stand still in stance and rise in half sines in swing.
 
         A foot stands at the mean of its planned positions in each stance. A swing that the plan
-        cuts off begins or ends where the plan does.
+        cuts off begins or ends at the first or last planned position.
 
         Args:
             plan_times: seconds of each plan state, shape (T + 1,).
-            planned: feet on the ground plane, shape (T + 1, feet, 2).
-            times: seconds at which feet are wanted, shape (n,).
-            height: metres, the peak of a swing.
+            planned: planned foot positions on the ground plane in metres, shape (T + 1, feet, 2).
+            times: seconds at which foot positions are computed, shape (n,).
+            height: height of a swing's peak in metres.
 
         Returns:
-            Positions with heights above the ground, shape (n, feet, 3).
+            Positions in metres, heights above the ground, shape (n, feet, 3).
         """
         feet = [
             self._swung(phase, plan_times, planned[:, foot], times, height)
@@ -81,7 +82,7 @@ class Gait:
         times: np.ndarray,
         height: float,
     ) -> np.ndarray:
-        """One foot (n, 3) from its planned positions (T + 1, 2)."""
+        """Positions of one foot (n, 3) from its planned positions (T + 1, 2). See `swung`."""
         slack = 1e-6
         # Stances [touchdown, lift-off] that overlap the plan.
         first = -phase * self.period

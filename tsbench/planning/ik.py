@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 
 SOLVER = "daqp"
-TOLERANCE = 1e-4  # m: feet this close to their targets are there
+TOLERANCE = 1e-4  # m, within which a foot counts as at its target
 MAX_ITERATIONS = 50
-DT = 1.0  # s, nominal: mink divides a step by it, we multiply it back
+DT = 1.0  # s, nominal: mink divides by it, the integration multiplies by it
 
 
 class FootPoses:
-    """Joint angles that put the feet where they are wanted while the base stays put.
+    """Solves for joint angles that put the feet at their targets while the base is fixed.
 
     Each solution starts from the one before, so neighbouring targets give neighbouring poses.
     """
@@ -37,7 +37,7 @@ class FootPoses:
         self._limits = [mink.ConfigurationLimit(model)]
 
     def solve(self, base: np.ndarray, feet: np.ndarray) -> tuple[np.ndarray, float]:
-        """One pose.
+        """Solves for one pose.
 
         Args:
             base: base position and orientation quaternion (w, x, y, z), shape (7,).
@@ -45,11 +45,11 @@ class FootPoses:
 
         Returns:
             Generalised positions, shape (nq,), and the largest distance that remains between a
-            foot and its target in metres. It is the caller who judges that: joint limits always
-            hold, so a target out of reach keeps a distance.
+            foot and its target in metres. Joint limits always hold, so a target out of reach leaves
+            a distance. The caller judges it.
         """
         q, residual = self._descend(self._configuration.q, base, feet)
-        if residual > TOLERANCE:  # a pose far off may be a dead end: once more from a good one
+        if residual > TOLERANCE:  # perhaps a local minimum: try again from the home pose
             again, other = self._descend(self._home, base, feet)
             if other < residual:
                 q, residual = again, other
@@ -59,7 +59,7 @@ class FootPoses:
     def _descend(
         self, first: np.ndarray, base: np.ndarray, feet: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Gauss-Newton from the joint angles of `first`."""
+        """Gauss-Newton iterations from the joint angles of `first`. See `solve`."""
         configuration = self._configuration
         q = first.copy()
         q[:7] = base
@@ -84,7 +84,7 @@ class FootPoses:
                 break
             configuration.integrate_inplace(velocity, DT)
             improved = self._residual(feet)
-            if improved > 0.999 * residual:  # as near as the limits let it come
+            if improved > 0.999 * residual:  # the joint limits allow no further progress
                 residual = improved
                 break
             residual = improved

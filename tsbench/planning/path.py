@@ -1,4 +1,4 @@
-"""Paths: polylines that a motion follows, whatever the time."""
+"""Paths: polylines that a motion follows, independent of time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Path:
 
     Attributes:
         vertices: metres, shape (n, 2).
-        lengths: metres from the first vertex to each, shape (n,).
+        lengths: metres along the path from the first vertex to each vertex, shape (n,).
     """
 
     vertices: np.ndarray
@@ -25,7 +25,7 @@ class Path:
 
     @classmethod
     def through(cls, points: np.ndarray) -> Path:
-        """The polyline through points in metres, shape (n, 2), without those that repeat."""
+        """The polyline through points in metres, shape (n, 2), without consecutive duplicates."""
         moved = np.linalg.norm(np.diff(points, axis=0), axis=-1)
         keep = np.concatenate([[True], moved > 1e-9])
         return cls(points[keep], np.concatenate([[0.0], np.cumsum(moved[moved > 1e-9])]))
@@ -34,23 +34,23 @@ class Path:
         """Distance to the nearest point in metres and the share of the path before it, each of
         shape (...,), for positions in metres, shape (..., 2).
 
-        Only the two segments at the nearest vertex are looked at: with short, similar segments
-        another one cannot be nearer by more than a fraction of a segment.
+        Only the two segments at the nearest vertex are considered. If segments are short and of
+        similar length, another one is nearer by a fraction of a segment at most.
         """
         xp = array_namespace(position)
         vertices, lengths = like(position, self.vertices), like(position, self.lengths)
         if len(self.vertices) == 1:
             distance = xp.linalg.vector_norm(position - vertices[0], axis=-1)
             return distance, 0.0 * distance
-        # |p - v|^2 less |p|^2, which does not change the order. Summed by hand: a matrix product
-        # would round differently for one position than for many.
+        # |p - v|^2 - |p|^2, which has its minimum at the same vertex. Written as sums: a matrix
+        # product would round differently for one position than for many.
         squared = (
             xp.sum(vertices * vertices, axis=-1)
             - 2.0 * position[..., None, 0] * vertices[:, 0]
             - 2.0 * position[..., None, 1] * vertices[:, 1]
         )
         nearest = xp.argmin(squared, axis=-1)[..., None] + like(position, _BEFORE_AND_AFTER)
-        index = xp.clip(nearest, 0, len(self.vertices) - 2)  # of two segments, shape (..., 2)
+        index = xp.clip(nearest, 0, len(self.vertices) - 2)  # of the two segments, shape (..., 2)
         a, b = vertices[index], vertices[index + 1]
         along = b - a
         length = lengths[index + 1] - lengths[index]

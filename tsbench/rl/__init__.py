@@ -1,1 +1,1 @@
-"""Reinforcement learning by rsl-rl: the only room that imports torch."""
+"""Reinforcement learning by rsl-rl. Of the library, only this package imports torch."""

@@ -1,8 +1,8 @@
-"""Proximal policy optimisation by rsl-rl, and the artefact it leaves behind.
+"""Proximal policy optimisation (Schulman et al. 2017) by rsl-rl, and the resulting policy artefact.
 
-rsl-rl's models, storage and update do the learning, or for small networks an update of our own
-(`rl/update.py`). Its runner is not used: it prints a page per iteration, stores the enclosing
-repository's diff and changes the configuration it is given.
+The models and the storage are rsl-rl's. The update is rsl-rl's too or, for small networks, the one
+in numpy (`rl/update.py`). rsl-rl's runner is not used: it prints a page per iteration, stores the
+diff of the enclosing repository and changes the configuration passed to it.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Learner:
         seed: int,
         actor_from: Learner | None = None,
     ) -> None:
-        """`actor_from` lends its actor, normalisers and all, to go on from; the critic, whose
-        values belong to another reward, starts anew but for its normaliser."""
+        """`actor_from` is a learner whose actor and normalisers are copied. The critic's weights
+        are new, because the other learner's values belong to another reward."""
         torch.manual_seed(seed)
         self.settings = settings
         self.environment = environment
@@ -86,7 +86,7 @@ class Learner:
                 self._actor.distribution.log_std_param.fill_(math.log(settings.initial_std))
 
     def _networks(self) -> tuple[MLPModel, MLPModel]:
-        """Actor and critic, new."""
+        """Actor and critic with initial weights."""
         s, env = self.settings, self._env
         observation = env.get_observations()
         groups = {"actor": ["policy"], "critic": ["value"]}
@@ -95,13 +95,14 @@ class Learner:
         }  # fmt: skip
         actor = MLPModel(
             observation, groups, "actor", env.num_actions, **shared,
-            # Of its logarithm's steps none is large when the spread is small: learned as it is, it
-            # collapses within some updates of a seed that has not found out yet what pays.
+            # The logarithm of the standard deviation is learned, so a gradient step changes a small
+            # deviation little. Learned directly, the deviation collapses within some updates on
+            # seeds that have not found rewarding actions yet.
             distribution_cfg={
                 "class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log",
             },
         )  # fmt: skip
-        with torch.no_grad():  # at first every mean action is nearly zero: the nominal pose
+        with torch.no_grad():  # so that initial mean actions are nearly zero, the nominal pose
             actor.mlp[-1].weight.mul_(0.01)
             actor.mlp[-1].bias.zero_()
         critic = MLPModel(observation, groups, "critic", 1, **shared)
@@ -111,12 +112,13 @@ class Learner:
     def learn(
         self, steps: int, report: Report | None = None, prepare: Prepare | None = None
     ) -> None:
-        """Goes on until `steps` environment steps have been taken in all, in whole iterations.
+        """Trains in whole iterations until the learner has taken `steps` environment steps.
 
         Args:
-            steps: of this learner since it was made.
-            report: takes the figures of each iteration.
-            prepare: called before each iteration, to change what depends on the steps taken.
+            steps: total steps since the learner was made.
+            report: receives the metrics of each iteration.
+            prepare: called before each iteration, to change settings that depend on the steps
+                taken.
 
         Raises:
             NotFiniteError: a number in state, reward, action or loss is not finite.
@@ -173,7 +175,8 @@ class Learner:
                 raise NotFiniteError(message, arrays)
 
     def _expect_sound(self) -> None:
-        """The losses are those before the last update; what it left is looked at too."""
+        """Checks the weights. The losses were computed before the last gradient step, so they do
+        not show a failure of that step."""
         networks = {"actor": self._actor, "critic": self._critic}
         finite = all(w.isfinite().all() for n in networks.values() for w in n.parameters())
         if not finite:
@@ -186,8 +189,8 @@ class Learner:
             raise NotFiniteError(message, arrays)
 
     def _settle(self, share: float) -> None:
-        """Holds the policy's spread below its bound, and lowers the learning rate, after a share
-        of the stage."""
+        """Limits the policy's standard deviation and lowers the learning rate, as scheduled after
+        `share` of the stage."""
         s = self.settings
         if s.final_std is not None:
             bound = s.initial_std * (s.final_std / s.initial_std) ** share
@@ -219,7 +222,8 @@ class Learner:
         self._length[ended] = 0
 
     def snapshot(self) -> dict[str, Any]:
-        """All that the next iteration depends on: plain values, and arrays that it will change."""
+        """Everything that the next iteration depends on: plain values, and arrays that the
+        iteration will overwrite."""
         return {
             "steps": self.steps,
             "actor": _arrays(self._actor.state_dict()),
@@ -236,10 +240,10 @@ class Learner:
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Goes on from where `snapshot` was taken, to the last bit.
+        """Restores the state of a snapshot, to the last bit.
 
         Raises:
-            TsbenchError: it was taken from another kind of learner.
+            TsbenchError: the snapshot belongs to another kind of learner.
         """
         try:
             self.steps = snapshot["steps"]
@@ -258,7 +262,7 @@ class Learner:
             raise TsbenchError(f"the checkpoint does not fit this stage: {reason}") from None
 
     def policy(self, task: Task[Any], method: str) -> Policy:
-        """What has been learned for the task, as an artefact."""
+        """The learned policy for the task, as an artefact."""
         linear = [module for module in self._actor.mlp if isinstance(module, torch.nn.Linear)]
         weights = tuple(layer.weight.numpy(force=True).copy() for layer in linear)
         normaliser = self._actor.obs_normalizer

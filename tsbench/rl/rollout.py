@@ -1,4 +1,4 @@
-"""The steps that an update learns from."""
+"""Collection of the steps that an update learns from."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from tensordict import TensorDict
 class Rollout:
     """Collects steps in rsl-rl's storage and computes their returns and advantages.
 
-    This is the first half of rsl-rl's `PPO`, to the last bit (tests/rl/test_update.py). `PPO` does
-    not collect without building an optimiser, for which the update in numpy has no use. As there,
-    all methods are called under `torch.inference_mode`.
+    The results equal those of rsl-rl's `PPO` to the last bit (tests/rl/test_update.py). `PPO`
+    itself always builds an optimiser, which the update in numpy does not need. As in rsl-rl, all
+    methods must be called under `torch.inference_mode`.
 
     Attributes:
-        storage: of the steps since the last update.
+        storage: storage of the steps since the last update.
     """
 
     def __init__(
@@ -33,11 +33,11 @@ class Rollout:
     ) -> None:
         """
         Args:
-            actor: chooses the actions.
-            critic: estimates what an observation is worth.
-            storage: empty.
-            discount: per action.
-            gae_lambda: of generalised advantage estimation (Schulman et al. 2016), per action.
+            actor: network that chooses the actions.
+            critic: network that estimates the value of an observation.
+            storage: an empty storage.
+            discount: discount per action, not per time step.
+            gae_lambda: lambda of generalised advantage estimation (Schulman et al. 2016).
             normalise: whether advantages are normalised over all steps.
         """
         self.storage = storage
@@ -61,8 +61,9 @@ class Rollout:
     def add(
         self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, torch.Tensor]
     ) -> None:
-        """Stores what the actions led to; all of shape (environments,). An episode that ended by
-        its last step, which `time_outs` in `extras` says, earns its last observation's value."""
+        """Stores the results of the actions; all tensors have shape (environments,). Where
+        `time_outs` in `extras` is one, the episode ended by its last step, and the discounted value
+        of its last observation is added to the reward."""
         step = self._step
         step.rewards = rewards.clone()
         step.dones = dones

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from tsbench.core.policy import ACTIVATIONS, ENCODINGS
 
-UPDATES = ("auto", "numpy", "rsl_rl")  # rl/update.py says what `auto` takes
+UPDATES = ("auto", "numpy", "rsl_rl")  # `make_update` in rl/update.py resolves `auto`
 OPTIMIZERS = ("adam", "adamw", "rmsprop", "sgd")  # rsl-rl's
 
 
@@ -16,29 +16,33 @@ class PPOSettings:
     """Attributes:
     environments: episodes stepped together.
     rollout: actions of each between two updates.
-    repeat: time steps for which an action is held while learning, so that it does enough to be
-        told from noise where a time step is short. The policy itself acts in every time step.
+    repeat: time steps for which an action is held while learning. Where time steps are short, the
+        effect of an action held for one step is lost in noise. The trained policy acts in every
+        step.
     epochs: passes over the collected steps in an update.
-    minibatches: per pass.
+    minibatches: minibatches per pass.
     discount: gamma, per time step.
-    gae_lambda: of generalised advantage estimation, per action.
+    gae_lambda: lambda of generalised advantage estimation, per action.
     clip: range of the probability ratio.
     clip_value: whether the value loss is clipped too.
     entropy: weight of the entropy bonus.
-    learning_rate: at first.
-    final_learning_rate: that the learning rate falls to geometrically over a stage, or None; only
-        without `desired_kl`. What is judged is the last policy, and a steady rate keeps it moving.
-    desired_kl: that the learning rate is adapted to after every minibatch, or None to keep it.
-    value_weight: of the value loss.
-    gradient_norm: that gradients are clipped to.
+    learning_rate: initial learning rate.
+    final_learning_rate: learning rate at the end of a stage, to which it falls geometrically, or
+        None; only without `desired_kl`. Only the last policy is scored, and a constant rate keeps
+        changing it.
+    desired_kl: divergence between old and new policy that the learning rate is adapted to after
+        every minibatch, or None not to adapt it.
+    value_weight: weight of the value loss.
+    gradient_norm: largest norm of a gradient; larger ones are clipped.
     hidden: sizes of the hidden layers of actor and critic.
-    activation: between the layers.
-    encoding: of observations before they are normalised, a name in `policy.ENCODINGS`.
-    initial_std: of the Gaussian policy, per unit of action.
-    final_std: what it is held below at the end of a stage, by a bound that falls geometrically
-        from `initial_std`; None for no bound. Where actions have dead zones, a policy can live on
-        its own noise, and its mean alone then fails.
-    bootstrap: whether an episode's last step counts as if it went on.
+    activation: activation of the hidden layers, a name in `policy.ACTIVATIONS`.
+    encoding: encoding of observations before normalisation, a name in `policy.ENCODINGS`.
+    initial_std: initial standard deviation of the Gaussian policy, per unit of action.
+    final_std: bound on the standard deviation at the end of a stage; the bound falls geometrically
+        from `initial_std`. None for no bound. If actions have dead zones, a policy can come to
+        depend on its own noise, and its mean action alone then fails.
+    bootstrap: whether the value of the last observation is added to the reward when an episode ends
+        by its last step.
     update: which update learns from the collected steps, a name in `UPDATES`.
     optimizer: a name in `OPTIMIZERS`.
     minibatch_advantages: whether advantages are normalised within each minibatch, instead of over

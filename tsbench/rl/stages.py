@@ -21,7 +21,7 @@ from tsbench.sim.physics import Physics
 @dataclass(frozen=True)
 class StageSettings(PPOSettings):
     """Attributes:
-    disturb: what is random about the physics that is learned in.
+    disturb: random disturbances of the physics in training.
     """
 
     disturb: Disturbances = field(default_factory=Disturbances)
@@ -52,9 +52,9 @@ def settings(problem: Problem, kind: str) -> StageSettings:
 
 
 def _changes(problem: Problem, kind: str) -> dict[str, Any]:
-    """What differs from the defaults. `finetune` goes on with the imitation stage's policy, so its
-    settings are changes to those of `imitate`, and pushes that have risen there stay at their
-    bound."""
+    """The settings that differ from the defaults. `finetune` continues with the imitation stage's
+    policy, so its settings are changes to those of `imitate`. Its pushes start at full size, which
+    those of the imitation stage have reached."""
     given, path = problem.training.get(kind, {}), f"task.training.{kind}"
     changes = typed_items(StageSettings, given, path)
     if kind != "finetune":
@@ -72,11 +72,11 @@ def _changes(problem: Problem, kind: str) -> dict[str, Any]:
 def learn_planning(
     problem: Problem, workspace: Workspace, steps: int, explore: float = 0.0
 ) -> Learner:
-    """PPO on the planning variant; `explore` as in `Planning`, in iterations that begin in the
-    first half of the steps.
+    """PPO on the planning variant. `explore` is that of `Planning` and applies to iterations that
+    begin in the first half of the steps.
 
-    Sampled states show what pays near the goal before the way there is known; starts from the
-    task's own start then give that way its due.
+    Sampled starts yield rewards near the goal before the planner knows the way there. The second
+    half trains on the task's own start only, from which the plan is made.
     """
     chosen = settings(problem, "plan")
     planning: Planning[Any] = Planning(problem.task, explore=explore)
@@ -114,7 +114,8 @@ def learn_physics(
 
 
 def _reporting(learner: Learner, monitor: Monitor, physics: Physics[Any] | None = None) -> Report:
-    """Reports a learner's iterations, once it stands where an interrupted run left it."""
+    """Restores the learner of an interrupted run, if there is one, and returns the function that
+    reports iterations."""
     if monitor.saved is not None:
         learner.restore(monitor.saved)
 

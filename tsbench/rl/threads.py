@@ -1,4 +1,4 @@
-"""How many threads the networks have."""
+"""The number of threads that networks use."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from threadpoolctl import threadpool_limits
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Gives torch and numpy's BLAS one thread each, and at the end what they had before.
+    """Limits torch and numpy's BLAS to one thread each, and restores their former limits at the
+    end.
 
-    The networks are small: more threads gain little on a free machine, stall on a busy one, and
-    change the rounding, and with it the result, from machine to machine. The physics has the cores.
+    The networks are small. More threads gain little on an idle machine and stall on a busy one.
+    They also change the rounding, and with it the result, from machine to machine. The other cores
+    are for the physics.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,9 +1,9 @@
 """PPO's update: rsl-rl's own, and the same in numpy for small networks on the CPU.
 
-rsl-rl's update of a network of 64 x 64 units by 256 actions takes torch five times as long as its
-arithmetic does: some 250 small operations, each dispatched, recorded and differentiated. In numpy
-the gradients are written out, on the memory of torch's parameters. tests/rl/test_update.py holds
-the two updates against each other.
+For networks of 64 x 64 units and minibatches of 256 actions, rsl-rl's update takes five times as
+long as its arithmetic: torch dispatches, records and differentiates some 250 small operations. The
+update in numpy computes the gradients by explicit formulas, in the memory of torch's parameters.
+tests/rl/test_update.py compares the two updates.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from torch import nn
 from tsbench.core.errors import TsbenchError
 from tsbench.rl.settings import PPOSettings
 
-WIDE = 512  # units of a hidden layer from which numpy gains less than a third (docs/speed.md)
+WIDE = 512  # hidden layer size from which numpy saves less than a third (docs/speed.md)
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8  # of Adam (Kingma and Ba 2015), as torch's defaults
-KL_RATES = (1e-5, 1e-2)  # that rsl-rl's adaptive learning rate stays between
-KL_FACTOR = 1.5  # by which that changes it
-KL_ROUNDING = 1e-12  # more than the divergence of a policy from itself, which says nothing about it
+KL_RATES = (1e-5, 1e-2)  # bounds of rsl-rl's adaptive learning rate
+KL_FACTOR = 1.5  # factor between two adaptive learning rates
+KL_ROUNDING = 1e-12  # divergences below it are rounding errors: keep the rate
 
 Array = np.ndarray  # float32, as torch's
 
@@ -35,21 +35,22 @@ class Update(Protocol):
     """Improves an actor and a critic by the steps in a storage.
 
     Attributes:
-        learning_rate: of both networks, in the next update.
+        learning_rate: learning rate of both networks in the next update.
     """
 
     learning_rate: float
 
     def update(self) -> dict[str, float]:
-        """Epochs over minibatches of the stored steps, shuffled once; empties the storage and
-        updates the normalisers. Returns the mean losses, `value` and `surrogate` among them."""
+        """Runs all epochs over minibatches of the stored steps, which are shuffled once. Then
+        empties the storage and updates the normalisers. Returns the mean losses, `value` and
+        `surrogate` among them."""
 
     def snapshot(self) -> dict[str, Any]:
-        """What the next update depends on beside the networks: plain values, and arrays that it
-        will change."""
+        """The state that the next update depends on besides the networks: plain values, and arrays
+        that the update will overwrite."""
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Goes on from where `snapshot` was taken."""
+        """Restores the state of a snapshot."""
 
 
 def make_update(
@@ -73,7 +74,7 @@ def make_update(
 
 
 class RslUpdate:
-    """rsl-rl's own, on any device. An `Update`."""
+    """rsl-rl's own update, on any device. An `Update`."""
 
     def __init__(
         self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, settings: PPOSettings
@@ -137,7 +138,7 @@ class RslUpdate:
 
 
 def _elu(x: Array, out: Array) -> None:
-    """In place; `out` is scratch."""
+    """In place; `out` is scratch memory."""
     np.exp(np.minimum(x, 0.0, out=out), out=out)
     out -= 1.0
     np.maximum(x, out, out=x)
@@ -165,7 +166,7 @@ def _tanh_slope(y: Array, out: Array) -> None:
     np.subtract(1.0, out, out=out)
 
 
-# What each of `policy.ACTIVATIONS` does to an array, in place, and its slope, from what it made.
+# For each of `policy.ACTIVATIONS`: the function, in place, and its slope, computed from its result.
 _ACTIVATIONS: dict[str, tuple[Callable[[Array, Array], None], Callable[[Array, Array], None]]] = {
     "elu": (_elu, _elu_slope),
     "relu": (_relu, _relu_slope),
@@ -174,16 +175,16 @@ _ACTIVATIONS: dict[str, tuple[Callable[[Array, Array], None], Callable[[Array, A
 
 
 class Network:
-    """A multilayer perceptron that lives in torch, its parameters and gradients in one vector each.
+    """A torch multilayer perceptron whose parameters share one numpy vector, as do its gradients.
 
     Attributes:
         log_std: view of the parameter that belongs to no layer, the logarithm of the actions'
             standard deviation; empty without one.
-        log_std_gradient: for the caller to fill.
+        log_std_gradient: gradient of `log_std`, which the caller writes.
     """
 
     def __init__(self, model: nn.Module, activation: str, most: float) -> None:
-        """`most` is the norm that gradients are clipped to."""
+        """`most` is the largest norm of the gradient; a larger one is clipped."""
         parameters = list(model.parameters())
         self._values = np.concatenate([p.detach().numpy().ravel() for p in parameters])
         self._gradient = np.zeros_like(self._values)
@@ -204,12 +205,13 @@ class Network:
             if id(p) not in inside:
                 self.log_std, self.log_std_gradient = value, gradient
         self._layers = [(*views[id(la.weight)], *views[id(la.bias)]) for la in layers]
-        self._outputs: list[Array] = []  # of each layer, activated
-        self._deltas: list[Array] = []  # the loss's gradients by those, before activation
+        self._outputs: list[Array] = []  # of each layer, after activation
+        self._deltas: list[Array] = []  # loss gradients by those before activation
         self._scratch: list[Array] = []
 
     def forward(self, x: Array) -> Array:
-        """Shape (batch, inputs) -> (batch, outputs), in memory that the next call writes to."""
+        """Inputs (batch, inputs) -> outputs (batch, outputs). The next call overwrites the
+        outputs."""
         if not self._outputs or len(self._outputs[0]) != len(x):
             shapes = [(len(x), len(weight)) for weight, *_ in self._layers]
             self._outputs, self._deltas, self._scratch = (
@@ -226,7 +228,8 @@ class Network:
         return x
 
     def backward(self, delta: Array) -> None:
-        """Gradients of a loss from those by the outputs of the last `forward`, same shape."""
+        """Computes the gradients of a loss. `delta` (batch, outputs) is the gradient of the loss
+        with respect to the outputs of the last `forward`."""
         for i in range(len(self._layers) - 1, -1, -1):
             weight, weight_gradient, _, bias_gradient = self._layers[i]
             x = self._outputs[i - 1] if i else self._input
@@ -240,7 +243,7 @@ class Network:
                 delta = before
 
     def step(self, rate: float) -> None:
-        """One of Adam, along the clipped gradient."""
+        """One step of Adam with the clipped gradient and learning rate `rate`."""
         gradient, (first, second) = self._gradient, self._moments
         norm = math.sqrt(float(gradient @ gradient))
         gradient *= min(self._most / (norm + 1e-6), 1.0)
@@ -258,7 +261,7 @@ class Network:
         self._values -= root
 
     def snapshot(self) -> dict[str, Any]:
-        """Of Adam; the parameters are torch's to save."""
+        """The state of Adam. The parameters are saved with the torch model."""
         first, second = self._moments
         return {"updates": self._updates, "first": first, "second": second}
 
@@ -269,11 +272,11 @@ class Network:
 
 
 class NumpyUpdate:
-    """rsl-rl's update of a Gaussian policy that has one spread for all states, in numpy. An
-    `Update`.
+    """rsl-rl's update in numpy, for a Gaussian policy whose standard deviation does not depend on
+    the state. An `Update`.
 
     Attributes:
-        learning_rate: of both networks, in the next update.
+        learning_rate: learning rate of both networks in the next update.
     """
 
     learning_rate: float
@@ -281,7 +284,7 @@ class NumpyUpdate:
     def __init__(
         self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, settings: PPOSettings
     ) -> None:
-        """Moves the networks' parameters to memory of numpy's; they have to be on the CPU."""
+        """Moves the networks' parameters, which must be on the CPU, to numpy arrays."""
         self.learning_rate = settings.learning_rate
         self._settings = settings
         self._actor = actor
@@ -328,7 +331,7 @@ class NumpyUpdate:
             )
         )  # fmt: skip
         losses = np.zeros(2)
-        with np.errstate(all="ignore"):  # the learner looks at what comes out
+        with np.errstate(all="ignore"):  # the learner checks losses and weights
             for _ in range(epochs):
                 for i in range(minibatches):
                     losses += (
@@ -347,9 +350,9 @@ class NumpyUpdate:
         self, seen: Array, actions: Array, log_prob: Array, advantage: Array, mean: Array,
         spread: Array,
     ) -> float:  # fmt: skip
-        """The clipped surrogate and the entropy bonus (Schulman et al. 2017, eq. 7 and 9); sets
-        the learning rate where that is adapted. Arrays are (batch, ...) and what was when the
-        actions were taken."""
+        """One step on the clipped surrogate and the entropy bonus (Schulman et al. 2017, eq. 7 and
+        9); adapts the learning rate if settings ask for that. Arrays have shape (batch, ...) and
+        hold the values at the time of the actions. Returns the surrogate loss."""
         s = self._settings
         now = self._policy.forward(seen)
         log_std = self._policy.log_std
@@ -363,7 +366,7 @@ class NumpyUpdate:
         low, high = 1.0 - s.clip, 1.0 + s.clip
         gain = advantage * ratio
         clipped = advantage * np.clip(ratio, low, high)
-        # Where clipping makes the gain smaller it does not depend on the policy any more.
+        # Where the clipped gain is the smaller one, the loss does not depend on the policy.
         by_log_prob = np.where(clipped < gain, np.float32(0.0), gain) * np.float32(-1.0 / len(gain))
         self._policy.backward(by_log_prob * z / std)
         by_log_std = by_log_prob * (z * z - 1.0)
@@ -373,7 +376,8 @@ class NumpyUpdate:
         return -float(np.mean(np.minimum(gain, clipped)))
 
     def _adapt(self, wanted: float, mean: Array, spread: Array, now: Array, std: Array) -> None:
-        """The learning rate, to a mean divergence of the policy from the one that acted."""
+        """Adapts the learning rate, so that the mean KL divergence of the current policy from the
+        one that acted comes near `wanted`."""
         ratio, distance = (spread.astype(float) / std) ** 2, ((mean - now) / std) ** 2
         kl = 0.5 * float(np.mean(np.sum(ratio - 1.0 - np.log(ratio) + distance, axis=1)))
         if kl > 2.0 * wanted:

@@ -1,4 +1,4 @@
-"""A batched environment as rsl-rl wants it."""
+"""A batched environment with the interface of rsl-rl."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tsbench.sim.batched import BatchedEnvironment
 
 
 class TorchEnvironment(VecEnv):
-    """Float32 tensors over a batched environment, its observations encoded, and each action held
+    """A batched environment with float32 tensors, encoded observations, and actions that are held
     for some steps.
 
     Attributes:
-        device: where the tensors are, in torch's words.
-        cfg: nothing; rsl-rl asks for it.
+        device: torch's name of the device of the tensors.
+        cfg: empty; rsl-rl requires the attribute.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class TorchEnvironment(VecEnv):
         repeat: int = 1,
         device: str = "cpu",
     ) -> None:
-        """`encoding` is a name in `policy.ENCODINGS`; `repeat` the steps of an action."""
+        """`encoding` is a name in `policy.ENCODINGS`; an action is held for `repeat` steps."""
         mdp = environment.mdp
         self.environment = environment
         self.repeat = repeat
@@ -52,9 +52,9 @@ class TorchEnvironment(VecEnv):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """`repeat` steps; the reward is the mean of theirs, not the sum, which keeps values small.
-        Of an episode that ends on the way the missing steps count as zero; the one that begins
-        waits for its first action with one of zeros. Extras, each of shape (num_envs,):
+        """`repeat` steps. The reward is the mean of their rewards, not the sum, which keeps values
+        small. If an episode ends on the way, the missing steps count as zero, and the next episode
+        gets actions of zeros until its first own action. Extras, each of shape (num_envs,):
         `time_outs`, whether an episode ended with its last step; `spared`, how many steps one that
         ended at its goal did not need, and `quality`, what each of them is worth."""
         held = actions.numpy(force=True).astype("float64")
@@ -83,12 +83,12 @@ class TorchEnvironment(VecEnv):
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """The environment's, with the observation that the next action answers."""
+        """The snapshot of the environment, and the observation for the next action."""
         observation = {name: tensor.numpy(force=True) for name, tensor in self._observation.items()}
         return {"observation": observation, "environment": self.environment.snapshot()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Goes on from where `snapshot` was taken."""
+        """Restores the state of a snapshot."""
         self.environment.restore(snapshot["environment"])
         for name, value in snapshot["observation"].items():
             self._observation[name].copy_(torch.from_numpy(value))

@@ -1,1 +1,1 @@
-"""Runs: a configuration in, a directory that explains itself out."""
+"""Runs: from a configuration to a run directory that documents itself."""

@@ -1,7 +1,7 @@
-"""Checkpoints: what an interrupted run goes on from, as data that cannot execute code.
+"""Checkpoints: the state that an interrupted run continues from, as data that cannot execute code.
 
 A checkpoint is a safetensors file: arrays, and JSON for the rest. Its name holds the hash of its
-content, so that one that was torn by a crash or damaged later is told from a whole one.
+content, so a file that a crash tore or that was damaged later is detected.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from tsbench.core.files import write_whole
 from tsbench.core.method import Snapshot
 
 FORMAT = 1
-KEPT = 2  # of each stage: should the last one turn out damaged, there is the one before
+KEPT = 2  # checkpoints of each stage: if the last one is damaged, the one before serves
 NAME = re.compile(r"(\d{2})-(\w+)-(\d{12})-([0-9a-f]{64})\.safetensors")
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Attributes:
-    stage: number of the stage in the run, from 0.
-    name: of the stage.
-    steps: environment steps of the stage.
-    path: the file.
-    content: what was saved.
+    """A checkpoint as it was read.
+
+    Attributes:
+        stage: number of the stage in the run, from 0.
+        name: the stage's name.
+        steps: environment steps of the stage so far.
+        path: the file.
+        content: the saved snapshot.
     """
 
     stage: int
@@ -48,7 +50,11 @@ class Checkpoints:
     """The checkpoints of a run, in a folder of its directory."""
 
     def __init__(self, folder: Path, damaged: Callable[[str], None]) -> None:
-        """`damaged` is told, in a line, of each file that cannot be used."""
+        """
+        Args:
+            folder: the folder of the checkpoints; `save` makes it.
+            damaged: takes one line about each file that cannot be used.
+        """
         self.folder = folder
         self._damaged = damaged
 
@@ -56,7 +62,7 @@ class Checkpoints:
         """Writes a checkpoint and removes the stage's oldest ones.
 
         Raises:
-            OSError: as the system says; the checkpoints from before are then still there.
+            OSError: the file cannot be written. The earlier checkpoints are still there then.
         """
         data = encode(content)
         digest = hashlib.sha256(data).hexdigest()
@@ -67,7 +73,10 @@ class Checkpoints:
             path.unlink()
 
     def newest(self, stage: int | None = None) -> Checkpoint | None:
-        """The last one that is whole: of a stage, or of the run."""
+        """The newest undamaged checkpoint of a stage, or with `stage` None of the run.
+
+        A damaged file is reported and renamed.
+        """
         for path in reversed(self._paths(stage)):
             match = NAME.fullmatch(path.name)
             assert match is not None
@@ -78,12 +87,12 @@ class Checkpoints:
                 return Checkpoint(int(match[1]), match[2], int(match[3]), path, decode(data))
             except (OSError, ValueError) as error:
                 self._damaged(f"damaged checkpoint {path} ({error}): going back to the one before")
-                with suppress(OSError):  # out of the way
+                with suppress(OSError):  # so that no later run reads it again
                     path.rename(f"{path}.damaged")
         return None
 
     def _paths(self, stage: int | None) -> list[Path]:
-        """In the order in which they were written."""
+        """The checkpoint files of a stage, or of all, in the order in which they were written."""
         if not self.folder.is_dir():
             return []
         paths = [path for path in self.folder.iterdir() if NAME.fullmatch(path.name)]
@@ -109,10 +118,10 @@ def _without_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any
 
 
 def decode(data: bytes) -> Snapshot:
-    """What `encode` was given.
+    """The snapshot that `encode` wrote.
 
     Raises:
-        ValueError: the bytes are something else.
+        ValueError: the bytes are no checkpoint of this format.
     """
     try:
         arrays = load(data)

@@ -1,7 +1,7 @@
 """The configuration of a run: `key=value` words, checked before anything starts.
 
-Hydra composes the words with the YAML files of `tsbench.conf` and of plug-ins; here the result gets
-its types, and whatever is wrong with it becomes one line.
+Hydra composes the words with the YAML files of `tsbench.conf` and of plug-ins. This module gives
+the result its types and turns every mistake in it into an error of one line.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from tsbench import methods, tasks
 from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.method import Budget
@@ -42,11 +43,11 @@ OPEN_MAPPINGS = ("task.training.", "task.constants.")
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """`conf/task/NAME.yaml`.
+    """The content of `conf/task/NAME.yaml`.
 
     Attributes:
         name: a registered task.
-        budgets: the budgets on offer, by name.
+        budgets: the task's budgets, by name.
         training: changes to the PPO settings by kind of stage (a method's `STAGES`).
         constants: changed constants of the task, for studies; such a score cannot be ranked.
     """
@@ -59,16 +60,19 @@ class TaskConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """`conf/config.yaml`.
+    """The configuration of a run, as `conf/config.yaml` composes it.
 
     Attributes:
-        task: the task's part.
+        task: the task's configuration.
         method: the method's name and its options.
         seed: in [0, 2**32).
         budget: a name among the task's budgets.
         directory: the run directory, or None for the standard place.
         threads: CPU threads, or None for all.
         checkpoint: seconds of training between checkpoints.
+
+    Raises:
+        TsbenchError: a value is missing, unknown or out of range.
     """
 
     task: TaskConfig
@@ -81,7 +85,7 @@ class RunConfig:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The part that decides what a run gives; the rest says where and with what."""
+        """The part of the configuration that determines a run's results."""
         elsewhere = ("directory", "threads", "checkpoint")
         return {name: value for name, value in asdict(self).items() if name not in elsewhere}
 
@@ -103,7 +107,10 @@ class RunConfig:
 
 
 class PluginConfigurations(SearchPathPlugin):
-    """Shows Hydra the configurations of plug-ins. tsbench's own come first: none replaces them."""
+    """Adds the configurations of plug-ins to Hydra's search path, after tsbench's own.
+
+    The order keeps a plug-in from replacing a configuration of tsbench.
+    """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in list(plugins.configurations())[1:]:
@@ -112,7 +119,7 @@ class PluginConfigurations(SearchPathPlugin):
 
 @contextmanager
 def found_by_hydra() -> Iterator[None]:
-    """Within it, Hydra finds the configurations of tsbench and of plug-ins."""
+    """Lets Hydra find the configurations of tsbench and of plug-ins within the context."""
     Plugins.instance().register(PluginConfigurations)
     with initialize_config_module(CONFIGURATIONS, version_base=VERSION_BASE):
         yield
@@ -133,7 +140,7 @@ def compose(words: Sequence[str]) -> RunConfig:
     try:
         with one_line_errors(), found_by_hydra():
             node = hydra_compose("config", overrides=opened(words))
-    except ValueError as error:  # Hydra's answer to a group's value that is no name
+    except ValueError as error:  # Hydra raises it where the value of a group is not a name
         raise TsbenchError(f"{_flat(error)} (in: {' '.join(words)})") from None
     return parse(node)
 
@@ -151,10 +158,10 @@ def parse(node: DictConfig) -> RunConfig:
 
 
 def sweep(words: Sequence[str]) -> Iterator[list[str]]:
-    """The jobs that a sweep (`-m`) over discrete values consists of, as words.
+    """The jobs of a sweep (`-m`) over discrete values, each as a list of words.
 
     Raises:
-        TsbenchError: the words cannot be read.
+        TsbenchError: a word cannot be read.
     """
     choices: list[list[str]] = []
     for override in parse_words(words):
@@ -163,20 +170,20 @@ def sweep(words: Sequence[str]) -> Iterator[list[str]]:
         elif override.is_discrete_sweep():
             key = override.get_key_element()
             choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
-        # What remains is an interval, which the sweeper draws from: each job checks its own value.
+        # The sweeper draws from the remaining kind, intervals: each job checks its own value.
     return (list(job) for job in itertools.product(*choices))
 
 
 def opened(words: Sequence[str]) -> list[str]:
-    """The words with `++` (add or change) before keys of mappings that YAML lists only in part."""
+    """The words, with `++` (add or change) before keys that the YAML files need not list."""
     return [f"++{word}" if word.startswith(OPEN_MAPPINGS) else word for word in words]
 
 
 def parse_words(words: Sequence[str]) -> list[Override]:
-    """The words in Hydra's grammar.
+    """The words, parsed by Hydra's grammar.
 
     Raises:
-        TsbenchError: one of them cannot be read.
+        TsbenchError: a word cannot be read, or changes the name of a task or method alone.
     """
     with one_line_errors():
         overrides = list(OverridesParser.create().parse_overrides(list(words)))
@@ -188,7 +195,7 @@ def parse_words(words: Sequence[str]) -> list[Override]:
 
 
 def names(group: str) -> tuple[str, ...]:
-    """The configurations of a group ("task" or "method"), sorted."""
+    """The names of the configurations of a group ("task" or "method"), sorted."""
     return tuple(sorted(_files(group)))
 
 
@@ -208,7 +215,7 @@ def budgets(task: str) -> dict[str, Budget]:
 
 
 def _files(group: str) -> dict[str, Traversable]:
-    """The files of a group by name; where two have one name, the one that Hydra takes."""
+    """The files of a group by name. Of two files with one name it keeps the one Hydra takes."""
     found: dict[str, Traversable] = {}
     for folder in plugins.configurations(group):
         for file in folder.iterdir():
@@ -219,7 +226,7 @@ def _files(group: str) -> dict[str, Traversable]:
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turns what Hydra and OmegaConf raise about the user's words into a TsbenchError."""
+    """Turns the errors of Hydra and OmegaConf about the user's words into a TsbenchError."""
     try:
         yield
     except OverrideParseException as error:
@@ -230,6 +237,11 @@ def one_line_errors() -> Iterator[None]:
             raise TsbenchError(_flat(error)) from None
         missing = str(error.missing_cfg_file)
         parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
+        registry = {"task": tasks, "method": methods}.get(parts[0])
+        if registry is not None and parts[2] in registry.names():
+            raise TsbenchError(
+                f"the {parts[0]} {parts[2]!r} cannot be run: its package lacks conf/{missing}.yaml"
+            ) from None
         raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__
@@ -243,5 +255,5 @@ def one_line_errors() -> Iterator[None]:
 
 
 def _flat(error: Exception) -> str:
-    """A message of several lines as one, without the list of places that were searched."""
+    """An error's message on one line, without Hydra's list of searched places."""
     return " ".join(str(error).split("Config search path")[0].split())

@@ -1,4 +1,4 @@
-"""What lies in a run directory, and how to read it back."""
+"""The run directory: its files and how to read them, and how a run is kept as an entry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tsbench.runs.config import RunConfig
 
 M = TypeVar("M", Plan, ReferenceMotion)
 
-# Names that `workspace` needs relative to the directory; `RunDirectory` has the paths of all files.
+# File names that `workspace` uses. `RunDirectory` has the paths of all files.
 METRICS = "metrics.jsonl"
 LOG = "log.txt"
 EVENTS = "tensorboard"
@@ -35,13 +35,13 @@ class Stage:
     """What a stage has used so far.
 
     Attributes:
-        name: as the method calls it.
-        budget: environment steps it may use.
-        steps: environment steps it has used.
-        physics_substeps: steps of the physics under them; none in a kinematic stage.
-        warnings: how often mujoco warned meanwhile, by mujoco's names.
-        seconds: wall-clock of the work that is in the result. What was lost when a run was
-            interrupted, and the time until it was resumed, do not count.
+        name: the method's name for the stage.
+        budget: environment steps that the stage may use.
+        steps: environment steps that the stage has used.
+        physics_substeps: physics steps within those; 0 in a kinematic stage.
+        warnings: number of MuJoCo's warnings during the stage, by MuJoCo's names.
+        seconds: wall-clock time of the work that is in the result. Work lost by an interruption
+            and the time until the run was resumed do not count.
         interruptions: how often the stage was resumed.
     """
 
@@ -59,14 +59,14 @@ class Record:
     """The content of `score.json`.
 
     Attributes:
-        task: its name.
-        task_version: of it.
-        standard: whether the task has its own constants; another score cannot be ranked.
-        method: that made the policy.
-        seed: of the training.
-        budget: its name.
-        score: of the policy.
-        stages: what the training took.
+        task: name of the task.
+        task_version: version of the task.
+        standard: whether the task had its standard constants; otherwise the score cannot be ranked.
+        method: name of the method that made the policy.
+        seed: seed of the training.
+        budget: name of the budget.
+        score: score of the policy.
+        stages: steps and seconds of each stage of the training.
     """
 
     task: str
@@ -80,16 +80,16 @@ class Record:
 
     @property
     def title(self) -> str:
-        """The run in a line."""
+        """One line that names the run."""
         return f"{self.task}, {self.method}, seed {self.seed}, budget {self.budget}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """The record as JSON holds it."""
         return {**asdict(self), "score": self.score.as_dict()}
 
 
 class _File:
-    """An attribute that is the path of a file with a fixed name in a directory."""
+    """An attribute of a `RunDirectory`: the path of a file with a fixed name."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -100,17 +100,17 @@ class _File:
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """The directory of a run or of a kept entry: where each file lies, and what it says.
+    """The directory of a run or of a kept entry: the paths of its files, and their content.
 
-    Whatever reads a file raises a TsbenchError that names it where it is missing or damaged.
+    Every method that reads a file raises a TsbenchError that names a missing or damaged file.
 
     Attributes:
-        path: of the directory.
+        path: the directory.
     """
 
     path: Path
 
-    config_file = _File("config.yaml")  # its first line is the command; it says that a run began
+    config_file = _File("config.yaml")  # begins with the command; its presence says: run begun
     versions_file = _File("versions.json")
     metrics_file = _File(METRICS)
     log_file = _File(LOG)
@@ -122,24 +122,24 @@ class RunDirectory:
     policy_info_file = _File("policy.json")
     policy_file = _File("policy.safetensors")
     actions_file = _File("actions.npz")
-    score_file = _File("score.json")  # written last: it says that a run is finished
+    score_file = _File("score.json")  # written last; its presence says: run finished
     curves_file = _File("learning_curves.png")
     view_file = _File("view.html")
-    report_file = _File("report.html")  # the last of the pages that are made of a finished run
+    report_file = _File("report.html")  # the last page that is made of a finished run
 
     @property
     def begun(self) -> bool:
-        """Whether a run has begun here."""
+        """Whether a run has begun in this directory."""
         return self.config_file.is_file()
 
     @property
     def trained(self) -> bool:
-        """Whether a run has anything that would be lost with its directory."""
+        """Whether the directory holds training progress, so that it must not be removed."""
         return self.metrics_file.exists() and self.metrics_file.stat().st_size > 0
 
     @property
     def finished(self) -> bool:
-        """Whether a run has been trained and scored here."""
+        """Whether a run in this directory has been trained and scored."""
         return self.score_file.exists()
 
     @property
@@ -152,11 +152,11 @@ class RunDirectory:
 
     @property
     def optional(self) -> tuple[Path, ...]:
-        """The files that an entry has as well where its method makes them."""
+        """The files that an entry has if its method makes them."""
         return self.plan_file, self.reference_file
 
     def config(self) -> RunConfig:
-        """The configuration that the run was made with."""
+        """The configuration of the run."""
         path = self.config_file
         try:
             with os_errors(path):
@@ -170,7 +170,7 @@ class RunDirectory:
         return config
 
     def versions(self) -> dict[str, Any]:
-        """What the run was made with."""
+        """The content of `versions.json`: versions and hashes of what the run was made with."""
         path = self.versions_file
         with os_errors(path):
             content = path.read_bytes()
@@ -193,19 +193,19 @@ class RunDirectory:
         return record
 
     def policy(self) -> Policy:
-        """The policy. A directory with nothing but its two files will do."""
+        """The policy. A directory with only the policy's two files suffices."""
         if not self.path.is_dir():
             raise TsbenchError(f"no run directory {self.path}")
         return Policy.load(self.path)
 
     def task(self, name: str) -> Task[Any]:
-        """The task of that name with the constants of the run; without a configuration here, the
-        standard one."""
+        """The task of that name with the run's constants; without a configuration file, with the
+        standard constants."""
         constants = self.config().task.constants if self.config_file.exists() else {}
         return tasks.make(name, **constants)
 
     def plan(self, task: Task[Any]) -> Plan | None:
-        """The plan for a task, if the run has one.
+        """The run's plan, or None if it has none.
 
         Raises:
             TsbenchError: the file is damaged, or the plan does not fit the task.
@@ -213,7 +213,7 @@ class RunDirectory:
         return _motion(Plan, self.plan_file, task)
 
     def reference(self, task: Task[Any]) -> ReferenceMotion | None:
-        """The plan as full poses, if the run has one.
+        """The run's reference motion (the plan as full poses), or None if it has none.
 
         Raises:
             TsbenchError: the file is damaged, or the motion does not fit the task.
@@ -221,7 +221,7 @@ class RunDirectory:
         return _motion(ReferenceMotion, self.reference_file, task)
 
     def actions(self) -> ActionLog | None:
-        """The action log, if the run has one."""
+        """The run's action log, or None if it has none."""
         return ActionLog.load(self.actions_file) if self.actions_file.exists() else None
 
 
@@ -234,9 +234,11 @@ def _motion(kind: type[M], path: Path, task: Task[Any]) -> M | None:
 
 
 def check_keep(run: RunDirectory, entry: Path, protocol: Protocol) -> None:
-    """
+    """Checks before an evaluation that `keep` can make an entry of the run.
+
     Raises:
-        TsbenchError: `keep` could not work, whatever the score.
+        TsbenchError: the protocol cannot be ranked; the run is not finished, mixes files of several
+            runs, has changed constants or a damaged file; or the entry exists.
     """
     if not protocol.ranked:
         raise TsbenchError(f"a score by protocol {protocol.name} cannot be an entry")
@@ -262,18 +264,22 @@ def check_keep(run: RunDirectory, entry: Path, protocol: Protocol) -> None:
         ("policy", (policy.sha256, record.score.origin.policy)),
     ):
         if len(set(said)) > 1:
-            raise TsbenchError(f"{run.path} mixes several runs: its files are not of one {what}")
+            raise TsbenchError(f"{run.path} mixes several runs: its files disagree on the {what}")
     run.plan(task)
     run.reference(task)
     check_new(entry, parents=True)
 
 
 def keep(run: RunDirectory, entry: Path, score: Score) -> None:
-    """Copies what matters of a run into a new directory, with a score made now.
+    """Copies the files of an entry from a run into a new directory, with a new score.
+
+    Args:
+        run: a finished run.
+        entry: the new directory.
+        score: the score of the run's policy, with its action log.
 
     Raises:
-        TsbenchError: the run is not finished or not of one piece, the score cannot be ranked, or
-            the directory exists or cannot be written.
+        TsbenchError: as `check_keep`, or the directory cannot be written.
     """
     check_keep(run, entry, score.origin.protocol)
     assert score.log is not None
@@ -289,7 +295,7 @@ def keep(run: RunDirectory, entry: Path, score: Score) -> None:
 
 
 def shown(record: Record) -> dict[str, Any]:
-    """What `--json` has of a run: its score's figures, whether they can be ranked with those of
-    others (`standard`), and what its stages took."""
+    """The figures of a run that `--json` writes: the score, whether it can be ranked (`standard`),
+    and the stages."""
     values = record.as_dict()
     return {**values["score"], "standard": values["standard"], "stages": values["stages"]}

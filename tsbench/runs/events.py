@@ -13,26 +13,26 @@ from tensorboard.summary import Writer
 
 from tsbench.core.errors import TsbenchError
 
-FILES = "events.out.tfevents.*"  # what TensorBoard's writer names its files
-_PLACE = ("stage", "steps", "seconds")  # of a row: where it belongs
-# What a row of another kind causes.
+FILES = "events.out.tfevents.*"  # the file names of TensorBoard's writer
+_PLACE = ("stage", "steps", "seconds")  # keys of a row that are no figures
+# Raised by a row of another format.
 _DAMAGED = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 
 
 class Events:
-    """The figures of a run's iterations for TensorBoard, under the tags STAGE/NAME.
+    """Writes the figures of a run's iterations for TensorBoard, under the tags STAGE/NAME.
 
-    All of them stand in the metrics too, so no run depends on its events: a resumed run makes them
-    anew, and a run that cannot write them goes on without. An event's time is the training time of
-    its stage.
+    The metrics hold all of these figures, so no run depends on its events: a resumed run makes them
+    again, and a run that cannot write them continues without them. The time of an event is the
+    training time of its stage in seconds.
     """
 
     def __init__(self, folder: Path, metrics: Path, failed: Callable[[str], None]) -> None:
         """
         Args:
-            folder: of the event files; those that are there are replaced.
+            folder: the folder of the event files; existing event files are replaced.
             metrics: the run's `metrics.jsonl`, with the rows so far.
-            failed: is told, once and in one line, why the events cannot be written.
+            failed: takes one line that says why the events cannot be written; called once.
 
         Raises:
             TsbenchError: the metrics are damaged.
@@ -40,7 +40,7 @@ class Events:
         self._failed = failed
         self._error: BaseException | None = None
         self._writer: Writer | None = None
-        # TensorBoard writes in a thread of its own. Python would print that thread's errors.
+        # TensorBoard writes in its own thread, whose errors Python would print on the terminal.
         self._hook = threading.excepthook
         threading.excepthook = self._noticed
         try:
@@ -48,7 +48,7 @@ class Events:
             for path in folder.glob(FILES):
                 path.unlink()
             self._writer = Writer(str(folder))
-        except (OSError, RuntimeError) as error:  # the latter where no thread can be started
+        except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
             self._error = error
         try:
             for line in metrics.read_text(encoding="utf-8").splitlines():
@@ -63,7 +63,7 @@ class Events:
         if self._writer is None:
             return
         try:
-            with np.errstate(over="ignore"):  # of numbers that float32 cannot hold
+            with np.errstate(over="ignore"):  # float32 cannot hold every figure
                 for name, value in row.items():
                     if name not in _PLACE:
                         tag = f"{row['stage']}/{name}"
@@ -74,7 +74,7 @@ class Events:
         self._tell()
 
     def close(self) -> None:
-        """Writes what is left, and ends the thread."""
+        """Writes the remaining events and ends TensorBoard's thread."""
         if self._writer is not None:
             try:
                 self._writer.close()
@@ -86,7 +86,7 @@ class Events:
             threading.excepthook = self._hook
 
     def _noticed(self, failure: threading.ExceptHookArgs) -> None:
-        """Keeps an error of TensorBoard's thread; leaves others to whoever had them before."""
+        """Keeps an error of TensorBoard's thread; passes all others to the previous hook."""
         if type(failure.thread).__module__.partition(".")[0] == "tensorboard":
             self._error = failure.exc_value
         else:

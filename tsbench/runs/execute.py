@@ -1,4 +1,4 @@
-"""One training run: a configuration in, a directory that explains itself out."""
+"""Executes one training run: trains, evaluates, and writes the run directory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tsbench.runs.workspace import RunWorkspace
 
 
 def prepare(config: RunConfig) -> Problem:
-    """What the configuration asks for, with all of it checked and nothing written.
+    """The problem that a configuration describes. Checks all of it and writes nothing.
 
     Raises:
         TsbenchError: unknown names, or values of the wrong type.
@@ -60,17 +60,17 @@ def prepare(config: RunConfig) -> Problem:
 
 
 def execute(config: RunConfig, words: Sequence[str] = (), console: Console | None = None) -> Score:
-    """Trains, evaluates, and leaves it all in `config.directory`, but for the pages about it.
+    """Trains, evaluates, and writes the run directory without its pages.
 
     Args:
-        config: what to run, with its directory.
-        words: of the command line, for the record.
-        console: where progress and results are shown.
+        config: the configuration, with its directory.
+        words: the words of the command line, recorded in the directory.
+        console: shows progress and results.
 
     Raises:
-        TsbenchError: the configuration is wrong, the directory exists or cannot be written, or
-            the method cannot do the task. A run that fails before it has trained leaves nothing.
-        Stopped: by Ctrl-C or SIGTERM.
+        TsbenchError: the configuration is wrong, the directory exists or cannot be written, or the
+            method cannot solve this kind of task. A run that fails before training leaves no files.
+        Stopped: Ctrl-C or SIGTERM stopped the run.
     """
     problem = prepare(config)
     run = RunDirectory(Path(config.directory or ""))
@@ -89,12 +89,12 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
 
 
 def resume(directory: Path, console: Console | None = None) -> Score:
-    """Goes on with an interrupted run, and ends with the same bits as if it had not been.
+    """Continues an interrupted run, and ends with the same bits as an uninterrupted run.
 
     Raises:
-        TsbenchError: there is no such run, it is finished or under way, or it was begun with
-            another configuration or other versions. Beyond that, as `execute`.
-        Stopped: by Ctrl-C or SIGTERM.
+        TsbenchError: the run does not exist, is finished or is running, or was begun with another
+            configuration or other versions. Beyond that, as `execute`.
+        Stopped: Ctrl-C or SIGTERM stopped the run.
     """
     run = RunDirectory(directory)
     if not run.begun:
@@ -113,14 +113,14 @@ def resume(directory: Path, console: Console | None = None) -> Score:
 
 
 def complete(config: RunConfig, words: Sequence[str] = ()) -> float:
-    """Does what is missing of a run of a sweep: all of it, the rest of it, or nothing.
+    """Executes or resumes a run of a sweep; skips a finished one.
 
     Returns:
-        Its normalized reward.
+        The normalized reward of the run.
 
     Raises:
-        TsbenchError: as `execute` and `resume`; or the directory holds another run.
-        Stopped: by Ctrl-C or SIGTERM.
+        TsbenchError: the directory holds another run. Beyond that, as `execute` and `resume`.
+        Stopped: Ctrl-C or SIGTERM stopped the run.
     """
     run = RunDirectory(Path(config.directory or ""))
     if not run.begun:
@@ -146,14 +146,19 @@ def _work(
     with closing(workspace), signals(workspace.stop), memory_errors(), one_thread():
         workspace.note(line)
         record = _train(config, problem, workspace, console)
-        write_json(run.score_file, record.as_dict())  # last: it says that the run is finished
+        write_json(run.score_file, record.as_dict())  # last: its presence says: run finished
     shutil.rmtree(run.checkpoints, ignore_errors=True)
     return record.score
 
 
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """Keeps others out of the directory. The system lifts the lock whenever the process ends."""
+    """Locks the directory against other processes. The system releases the lock when the process
+    ends, however it ends.
+
+    Raises:
+        TsbenchError: another process has the lock.
+    """
     with os_errors(directory):
         descriptor = os.open(directory, os.O_RDONLY)
     try:
@@ -168,7 +173,7 @@ def _locked(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def signals(stop: Callable[[int], None]) -> Iterator[None]:
-    """Lets Ctrl-C and SIGTERM call `stop` with their number, where this thread may do that."""
+    """Lets Ctrl-C and SIGTERM call `stop` with their number, if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -185,7 +190,7 @@ def signals(stop: Callable[[int], None]) -> Iterator[None]:
 
 @contextmanager
 def _explained(run: RunDirectory) -> Iterator[None]:
-    """Turns what stops a run into one line, which says how to go on where one can."""
+    """Turns the error that stops a run into one line, and adds how to resume where possible."""
     try:
         with os_errors(run.path):
             yield
@@ -198,12 +203,12 @@ def _explained(run: RunDirectory) -> Iterator[None]:
 
 
 def _dumped(path: Path, error: NotFiniteError) -> str:
-    """Keeps what the wrong number was computed from."""
+    """Saves the arrays that a number that is not finite was computed from; returns a note on it."""
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **error.arrays)
     with os_errors(path):
         write_whole(path, content.getvalue())
-    return f"; what it came from is in {path}"
+    return f"; its inputs are in {path}"
 
 
 def _way_on(run: RunDirectory) -> str:
@@ -236,7 +241,11 @@ def _train(
 
 
 def _create(run: RunDirectory) -> None:
-    """Makes the directory. One that is empty, or that a run left before it began, will do."""
+    """Makes the directory. An existing one may be empty or hold what a run left before it began.
+
+    Raises:
+        TsbenchError: the directory holds a run or other files.
+    """
     run.path.mkdir(parents=True, exist_ok=True)
     left = {path.name.removesuffix(PART) for path in run.path.iterdir()}
     if left <= {run.versions_file.name, run.config_file.name} and not run.config_file.exists():
@@ -251,7 +260,12 @@ def _create(run: RunDirectory) -> None:
 
 
 def _leave_as_found(directory: Path, found: set[Path] | None) -> None:
-    """Removes what a run has written; `found` is what was there before, None for no directory."""
+    """Removes what a run has written.
+
+    Args:
+        directory: the run directory.
+        found: the paths in it before the run; None if the directory did not exist.
+    """
     if found is None:
         shutil.rmtree(directory, ignore_errors=True)
         return

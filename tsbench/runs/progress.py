@@ -11,7 +11,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 @contextmanager
 def progress_bar(console: Console, what: str) -> Iterator[Callable[[float], None]]:
-    """A bar that takes shares from 0 to 1, on a terminal; elsewhere it shows nothing."""
+    """A progress bar on a terminal; elsewhere nothing is shown. Yields a function that takes the
+    share done, in [0, 1]."""
     columns = (TextColumn("{task.description:<10}"), BarColumn(), TaskProgressColumn())
     with Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal

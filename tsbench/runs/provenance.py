@@ -1,4 +1,4 @@
-"""What a run was made from: all that decides what it gives, to the last bit."""
+"""Provenance: the configuration, code, versions and physics that determine a run's results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tsbench.runs.directory import RunDirectory
 from tsbench.sim.model import compiled_hash
 
 PACKAGE = Path(str(files("tsbench")))
-# What can change a number in a run.
+# Packages whose version can change a number in a run.
 PACKAGES = (
     "dm-control",
     "gymnasium",
@@ -39,7 +39,7 @@ PACKAGES = (
     "torch",
     "tsbench",
 )
-_NAMES = {  # of what has to stay the same, in words
+_NAMES = {  # the keys of `identity`, in words
     "configuration": "configuration",
     "python": "version of Python",
     "packages": "version of a package",
@@ -52,8 +52,10 @@ _NAMES = {  # of what has to stay the same, in words
 def write_provenance(
     run: RunDirectory, config: RunConfig, problem: Problem, words: Sequence[str]
 ) -> None:
-    """Writes what is needed to repeat the run: versions.json, and config.yaml, which comes last:
-    its presence says that the run has begun."""
+    """Writes versions.json and config.yaml, which suffice to repeat the run.
+
+    config.yaml comes last: its presence says that the run has begun.
+    """
     versions = {
         **identity(config, problem),
         "platform": platform.platform(),
@@ -67,7 +69,10 @@ def write_provenance(
 
 
 def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
-    """All that decides what a run gives, to the last bit, on one kind of machine."""
+    """Hashes and versions that determine a run's results to the last bit, on one kind of machine.
+
+    They cover the configuration, Python, packages, tsbench's code, plug-ins and the physics model.
+    """
     code = hashlib.sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
         code.update(path.read_bytes())
@@ -88,9 +93,10 @@ def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
 
 
 def check_provenance(run: RunDirectory, config: RunConfig, problem: Problem) -> None:
-    """
+    """Checks that a resumed run would end with the same bits as the run that was begun.
+
     Raises:
-        TsbenchError: a run begun as `versions.json` says would not go on to the same bits now.
+        TsbenchError: a part of the run's identity differs from its `versions.json`.
     """
     before = run.versions()
     for name, now in identity(config, problem).items():
@@ -109,7 +115,7 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that tsbench lies in, with "+" when it has been changed."""
+    """The git commit of tsbench's checkout, with "+" if files were changed; None without git."""
     root = PACKAGE.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
         return None

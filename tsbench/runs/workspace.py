@@ -1,4 +1,4 @@
-"""What a method reports while it trains: progress for the eye, and records in plain files."""
+"""The workspace of a run: shows a method's progress, and writes metrics, log and checkpoints."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from tsbench.runs.directory import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
 from tsbench.runs.events import Events
 
 INTERVAL = 30.0  # seconds of training between checkpoints
-PLAIN_INTERVAL = 60.0  # seconds between lines where there is no terminal to draw a bar on
-PLAIN_SHARE = 0.1  # or this share of the stage, whichever is first
+PLAIN_INTERVAL = 60.0  # seconds between lines where no terminal can show a bar
+PLAIN_SHARE = 0.1  # or a line after this share of the stage, whichever is first
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Saved:
     """The content of a checkpoint.
 
     Attributes:
-        run: which run it belongs to.
-        stages: the finished ones and the one under way.
-        sizes: bytes of the files that were written until then and are not written anew.
-        learner: what the stage under way goes on from.
+        run: hash that identifies the run.
+        stages: the finished stages and the current one.
+        sizes: bytes so far of each file that a resumed run appends to.
+        learner: the snapshot that the current stage continues from.
     """
 
     run: str
@@ -47,7 +47,10 @@ class Saved:
 
 @dataclass
 class RunMonitor:
-    """Takes a stage's figures, once for each iteration of its learner. A `problem.Monitor`."""
+    """Takes a stage's figures, once for each iteration of its learner.
+
+    It implements `core.method.Monitor`.
+    """
 
     workspace: RunWorkspace
     stage: Stage
@@ -80,12 +83,12 @@ class RunMonitor:
         metrics: Mapping[str, float],
         snapshot: Callable[[], Snapshot] | None = None,
     ) -> None:
-        """Records an iteration and, when it is time, saves what to go on from.
+        """Records an iteration, and saves a checkpoint when one is due.
 
         Args:
             steps: environment steps of this stage so far.
-            metrics: named scalars, such as episode_return; those that are not finite are dropped.
-            snapshot: gives all that the next iteration depends on.
+            metrics: named scalars, such as episode_return; values that are not finite are dropped.
+            snapshot: returns the state that the next iteration depends on.
 
         Raises:
             Stopped: a signal has arrived.
@@ -101,7 +104,7 @@ class RunMonitor:
 
 @dataclass
 class Finished:
-    """The monitor of a stage that was finished before the run was interrupted: all is known."""
+    """The monitor of a stage that was finished before the run was interrupted."""
 
     saved: Snapshot | None
     physics_substeps: int = 0
@@ -113,15 +116,15 @@ class Finished:
         metrics: Mapping[str, float],
         snapshot: Callable[[], Snapshot] | None = None,
     ) -> None:
-        """Nothing is left to record."""
+        """Does nothing: the stage has been recorded."""
 
 
 class RunWorkspace:
     """A run directory in use: `metrics.jsonl`, TensorBoard events, `log.txt` and checkpoints.
 
-    A `problem.Workspace`. Everything is written at once, line by line. In a directory that an
-    interrupted run left, the metrics go back to the newest checkpoint, and the events with them:
-    what came after it is done again.
+    It implements `core.method.Workspace`. Every line is written immediately. When a run is resumed,
+    metrics and events are cut back to the newest checkpoint, and the iterations after it are
+    repeated.
     """
 
     def __init__(
@@ -129,14 +132,14 @@ class RunWorkspace:
     ) -> None:
         """
         Args:
-            directory: of the run.
-            console: where progress is shown.
+            directory: the run directory.
+            console: shows progress.
             interval: seconds of training between checkpoints.
-            run: tells this run from others: their checkpoints are refused.
+            run: hash that identifies this run; checkpoints of other runs are refused.
 
         Raises:
-            TsbenchError: the checkpoints are another run's, or the metrics have been cut since or
-                are damaged.
+            TsbenchError: the checkpoints are another run's, or the metrics are damaged or shorter
+                than the checkpoint says.
         """
         self.directory = directory
         self.stages: list[Stage] = []
@@ -157,7 +160,7 @@ class RunWorkspace:
             self._files = files.pop_all()
 
     def _newest(self) -> tuple[int, Saved | None]:
-        """The stage to go on with, and where; -1 and nothing if the run has to begin anew."""
+        """Number of the stage to continue and its checkpoint; -1 and None if there is none."""
         checkpoint = self._checkpoints.newest()
         if checkpoint is None:
             return -1, None
@@ -167,7 +170,7 @@ class RunWorkspace:
         return checkpoint.stage, saved
 
     def _rewind(self) -> None:
-        """Drops from the metrics what will be done again."""
+        """Cuts the metrics back to the newest checkpoint."""
         path, size = self.directory / METRICS, self._saved.sizes[METRICS] if self._saved else 0
         if self._metrics.tell() < size:
             raise TsbenchError(f"{path} has been cut since the last checkpoint")
@@ -184,17 +187,16 @@ class RunWorkspace:
         self._files.close()
 
     def note(self, line: str) -> None:
-        """Tells the user something in plain words, and keeps it in the log."""
+        """Shows the user a line, and adds it to the log."""
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
         self._log.write(f"{time.perf_counter() - self._began:10.1f} s  {line}\n")
         self._log.flush()
 
     def stop(self, signal: int) -> None:
-        """Stops the run: when the iteration under way is done and saved; where there is none, or
-        when asked again, at once.
+        """Asks the run to stop once the current iteration is done and saved.
 
         Raises:
-            Stopped: at once.
+            Stopped: immediately, if no iteration is running or if the run was asked before.
         """
         if self._stopped_by is not None or not self._learning:
             raise Stopped(signal)
@@ -205,8 +207,8 @@ class RunWorkspace:
         """A stage of the method, with its progress bar.
 
         Args:
-            name: e.g. "plan", "imitate".
-            steps: environment steps that it may use.
+            name: the stage's name, such as "plan" or "imitate".
+            steps: environment steps that the stage may use.
         """
         number, learner = len(self.stages), None
         stage = Stage(name, steps)
@@ -238,7 +240,7 @@ class RunWorkspace:
         self._events.add(row)
 
     def keep(self, stage: Stage, snapshot: Callable[[], Snapshot]) -> None:
-        """Saves a checkpoint if it is time: now and then, at the stage's end, before a stop.
+        """Saves a checkpoint after each interval, at the stage's end and before a stop.
 
         Raises:
             Stopped: a signal has arrived.
@@ -271,12 +273,12 @@ def _read(checkpoint: Checkpoint) -> Saved:
 
 
 class _Display:
-    """A progress bar on a terminal, elsewhere a line now and then."""
+    """Shows a progress bar on a terminal, and a line at intervals elsewhere."""
 
     def __init__(self, console: Console, stage: Stage) -> None:
         self._console = console
         self._bar: Progress | None = None
-        self.figures = ""  # in words, as last shown
+        self.figures = ""  # the text last shown
         self._shown_at = time.perf_counter()
         self._shown_steps = 0
         if console.is_terminal:
@@ -299,7 +301,7 @@ class _Display:
             self._bar.stop()
 
     def show(self, stage: Stage, reward: float | None) -> None:
-        """Draws the stage's progress; `reward` is the learner's mean return, where known."""
+        """Shows the stage's progress; `reward` is the learner's mean return, None if unknown."""
         rate = stage.steps / max(stage.seconds, 1e-9)
         left = max(stage.budget - stage.steps, 0) / max(rate, 1e-9)
         self.figures = f", reward {number(reward)}, {rate:,.0f} steps/s"

@@ -1,1 +1,1 @@
-"""How tasks are stepped: one at a time by dm_control, or many at once."""
+"""Simulation of tasks: one episode at a time by dm_control, or many at once."""

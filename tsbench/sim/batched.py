@@ -17,17 +17,17 @@ from tsbench.sim.dynamics import LastingDynamics, expect_finite, expect_shape
 
 @dataclass(frozen=True)
 class Transition(Generic[S]):
-    """What a step gave; shapes (n,) unless said otherwise.
+    """The result of a step; shapes are (n,) unless said otherwise.
 
     Attributes:
-        observation: of the state that follows, shape (n, observation_size); where an episode
-            ended, of the next one's start.
-        reward: of the step.
-        terminal: the episode ended for a reason other than its last step. Its physics having
-            diverged is one; the reward of that step is zero.
-        truncated: the episode ended with its last step.
-        ended: the rows of either kind of ending, shape (k,).
-        final: the states that those episodes ended in, k of them.
+        observation: observation of the next state, shape (n, observation_size); where an episode
+            ended, of the start of the next episode.
+        reward: reward of the step; zero where the physics diverged.
+        terminal: whether the episode ended for a reason other than its last step. Divergence of
+            the physics is such a reason.
+        truncated: whether the episode ended with its last step.
+        ended: rows in which an episode ended, shape (k,).
+        final: the last states of those episodes, k of them.
         spared: steps that an episode which arrived at its goal did not need (`MDP.spared`).
         quality: what each of those is worth beside a perfect one, in [0, 1].
     """
@@ -110,7 +110,7 @@ class BatchedEnvironment(Generic[S]):
         return Transition(observation, reward, terminal, truncated, ended, final, spared, quality)
 
     def snapshot(self) -> dict[str, Any]:
-        """All that the next step depends on, but for the action: plain values and arrays."""
+        """Everything that the next step depends on besides the action: plain values and arrays."""
         return {
             "rng": self.rng.bit_generator.state,
             "steps": self.steps,
@@ -120,7 +120,7 @@ class BatchedEnvironment(Generic[S]):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Goes on from where `snapshot` was taken; `reset` must have been called before."""
+        """Restores the state of a snapshot; `reset` must have been called before."""
         self.rng.bit_generator.state = snapshot["rng"]
         self.steps = snapshot["steps"]
         self.course = self.course.replace(**snapshot["course"])

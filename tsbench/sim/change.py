@@ -1,4 +1,4 @@
-"""Changes to the physics: what a policy meets when the world is not quite its own."""
+"""Changes to the physics that a policy was trained in."""
 
 from __future__ import annotations
 

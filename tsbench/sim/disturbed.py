@@ -1,4 +1,4 @@
-"""A world that is not quite the task's own, to train in: random pushes and random physics."""
+"""Training under disturbances: random pushes and random physics."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ MOST_LATENCY = 100  # control steps; more is a mistake
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What is random, all of it uniform; zeros disturb nothing.
+    """Random disturbances, all uniformly distributed; zeros disturb nothing.
 
     Attributes:
-        push: newtons at most, on the body that the task lets be pushed, at any heading.
-        rise: environment steps over which that bound grows evenly from none to `push`: who is
-            pushed over from the first step on learns nothing.
-        calm: share of the episodes without a push: what is judged first is the task as it is.
-        interval: seconds from push to push. The first comes at random within one.
-        duration: of a push in seconds.
-        mass: largest change of all masses, as a share, up or down; of each environment its own.
+        push: largest force of a push in newtons, on the task's pushed body, at any heading.
+        rise: environment steps over which the largest force grows linearly from zero to `push`. A
+            policy that is pushed over from the first step on learns nothing.
+        calm: share of the episodes without a push, because scores start with the undisturbed task.
+        interval: seconds from push to push. The first comes at random within one interval.
+        duration: duration of a push in seconds.
+        mass: largest change of all masses, as a share, up or down; drawn for each environment.
         friction: the same for friction.
         strength: the same for the strength of the motors.
         latency: control steps at most by which actions come late; of each episode its own, all
@@ -141,7 +141,7 @@ class DisturbedPhysics(Physics[S]):
         self._latency, self._actions = snapshot["latency"], snapshot["actions"]
 
     def push_force(self, time: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
-        """Of the push that is the latest by the end of the step."""
+        """The force of the latest push that begins before the end of the step. See `Physics`."""
         first, interval = self._first[rows], self.disturbances.interval
         number = np.floor((time + self.task.timestep - first) / interval).astype(int)
         number = np.clip(number, 0, self._forces.shape[1] - 1)

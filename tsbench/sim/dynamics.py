@@ -1,4 +1,4 @@
-"""What turns actions into states, and what is looked at on the way."""
+"""Dynamics, which turn actions into states, and checks of their inputs and results."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from tsbench.core.state import Rng, S, State
 
 
 class Dynamics(Protocol[S]):
-    """What turns actions into states, for a fixed number of episodes.
+    """Dynamics of a fixed number of episodes: they turn actions into states.
 
     Attributes:
         diverged: rows in which the last step could not be computed, sorted. They keep the state
-            they had before it, and their episodes have to end.
-        seconds: spent in a physics engine so far, wall-clock.
+            before that step, and their episodes have to end.
+        seconds: wall-clock time spent in a physics engine so far.
     """
 
     diverged: np.ndarray
@@ -32,19 +32,20 @@ class Dynamics(Protocol[S]):
 
 
 class LastingDynamics(Dynamics[S], Protocol[S]):
-    """Dynamics that can be saved and go on later."""
+    """Dynamics that can be saved and restored."""
 
     def snapshot(self) -> dict[str, Any]:
-        """All that it remembers between two calls: plain values and arrays."""
+        """All data that is kept between two calls: plain values and arrays."""
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Goes on from where `snapshot` was taken."""
+        """Restores the state of a snapshot."""
 
 
 def expect_shape(action: np.ndarray, shape: tuple[int, ...]) -> None:
-    """
+    """Checks the shape of an action, since numpy would broadcast some wrong shapes.
+
     Raises:
-        TsbenchError: the action has another shape; numpy would stretch or cut some of them.
+        TsbenchError: the action has another shape.
     """
     if np.shape(action) != shape:
         raise TsbenchError(f"the action has shape {np.shape(action)}, not {shape}")
@@ -58,18 +59,19 @@ def expect_finite(
     reward: np.ndarray | None = None,
     rows: np.ndarray | None = None,
 ) -> None:
-    """Looks at a step of many episodes.
+    """Checks that the numbers of a step of n episodes are finite.
 
     Args:
-        steps: of each episode so far, shape (n,).
+        steps: number of steps in each episode so far, shape (n,).
         previous: the state before the step.
-        action: shape (n, action_size).
-        state: the state after it, once it is known.
-        reward: of the step, shape (n,), once it is known.
-        rows: which of the environments these are, shape (n,), where they are not all.
+        action: actions, shape (n, action_size).
+        state: the state after the step; None before it is known.
+        reward: reward of the step, shape (n,); None before it is known.
+        rows: indices of the episodes' environments, shape (n,); None for all environments.
 
     Raises:
-        NotFiniteError: a number is not finite. It names the episode, its step and the quantity.
+        NotFiniteError: a number is not finite. The message names the environment, the step of its
+            episode and the quantity.
     """
     looked_at: dict[str, np.ndarray] = {"action": action}
     if state is not None and reward is not None:

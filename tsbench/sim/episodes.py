@@ -28,7 +28,7 @@ class Episodes(Generic[S]):
         course: of each episode. Its physics having diverged, which ends it with a reward of zero
             for that step, is a violation.
         diverged: whether that happened, shape (n,).
-        cut: whether it ended for a reason other than its goal or its last step, shape (n,).
+        cut: whether the episode ended for a reason other than its goal or its last step, (n,).
         credit: what the spared steps earn (`MDP.credit`), shape (n,).
         first: the state that each episode began in, or went on from.
         final: the last state of each episode.
@@ -57,14 +57,13 @@ class Episodes(Generic[S]):
 
     @property
     def returns(self) -> np.ndarray:
-        """Undiscounted, shape (n,). The steps missing from an episode that arrived at its goal are
-        credited, those missing from any other count as nothing."""
+        """Undiscounted returns, shape (n,). They include the credit of steps spared by arrivals."""
         total: np.ndarray = self.rewards.sum(axis=0) + self.credit
         return total
 
     @property
     def normalized(self) -> np.ndarray:
-        """Returns over the largest conceivable one, shape (n,)."""
+        """Returns divided by the return of `max_reward` in every step, shape (n,)."""
         return self.returns / (self.max_reward * self.limits)
 
     @property

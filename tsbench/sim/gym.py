@@ -1,10 +1,10 @@
 """Tasks and their variants as Gymnasium environments, one at a time or many at once.
 
-Both are thin coats over the environments that tsbench itself uses: the floats are the same.
-Who arrives at a goal that ends the episode is spared the remaining steps, and a score counts them
-as perfect ones. When an episode ends, `info["spared"]` says how many: to a learner that takes an
-arrival for an ending like a fall, hovering just outside the goal beats arriving.
-A task's spread of starts is drawn from `np_random`.
+Both classes wrap the environments that tsbench itself uses, and return the same floats.
+Some tasks end an episode when the robot arrives at the goal. The score counts the remaining steps,
+which the arrival spares, as perfect steps. When an episode ends, `info["spared"]` gives their
+number. A learner that ignores it treats an arrival like a fall, and earns more by hovering just
+outside the goal. Random starts are drawn from `np_random`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ HEIGHT, WIDTH = 480, 640  # pixels
 
 
 def spaces(mdp: MDP[Any]) -> tuple[Box, Box]:
-    """Of observations, any float64, and of actions, the box [-1, 1] in float32, which learners
-    expect; float64 actions are taken as they are."""
+    """The spaces of observations (any float64) and of actions (the box [-1, 1]).
+
+    The action space is float32, which learners expect. Environments take float64 actions too.
+    """
     observation = Box(-np.inf, np.inf, (mdp.observation_size,), np.float64)
     return observation, Box(-1.0, 1.0, (mdp.action_size,), np.float32)
 
@@ -36,19 +38,22 @@ def spaces(mdp: MDP[Any]) -> tuple[Box, Box]:
 class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """A dm_control environment of tsbench as a `gymnasium.Env`.
 
-    `terminated` is an ending for a reason other than the last step, `truncated` the last step.
-    At the end `info["spared"]` counts the steps that an arrival at the goal spares. A seed makes
-    the episodes that follow those of `tsbench.load(..., seed=seed)`.
+    `truncated` means that the episode ended at its last step, `terminated` that it ended for
+    another reason. At the end `info["spared"]` counts the steps that an arrival at the goal spares.
+    After `reset(seed=seed)` the episodes are those of `tsbench.load(..., seed=seed)`.
 
     Attributes:
-        single: the environment within.
+        single: the wrapped dm_control environment.
     """
 
     def __init__(self, single: Environment, render_mode: str | None = None) -> None:
-        """`render_mode` "rgb_array" is for `render`.
+        """
+        Args:
+            single: the environment to wrap.
+            render_mode: "rgb_array" lets `render` draw pictures; None does not.
 
         Raises:
-            TsbenchError: another mode.
+            TsbenchError: the render mode is unknown.
         """
         if render_mode not in (None, *RENDER_MODES):
             raise unknown("render mode", str(render_mode), RENDER_MODES)
@@ -76,7 +81,7 @@ class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         return observation, time_step.reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The model's first camera's picture, shape (480, 640, 3), or None without a mode."""
+        """The picture of the model's first camera, shape (480, 640, 3); None without a mode."""
         if self.render_mode is None:
             return None
         picture: np.ndarray = self.single.physics.render(HEIGHT, WIDTH, camera_id=0)
@@ -89,12 +94,12 @@ class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 class GymVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """A batched environment as a `gymnasium.vector.VectorEnv`.
 
-    Its autoreset mode is *same step*: where an episode ends, `step` returns the observation that
-    the next one starts with, and `infos["final_obs"]` holds the one that it ended with (an array
-    of objects, None where no episode ended; `infos["_final_obs"]` says where one did).
+    Its autoreset mode is *same step*: where an episode ends, `step` returns the first observation
+    of the next episode. `infos["final_obs"]` holds the last observation of the ended one, in an
+    array of objects with None where no episode ended; `infos["_final_obs"]` marks the ended ones.
 
     Attributes:
-        batched: the environments within.
+        batched: the wrapped batched environment.
     """
 
     def __init__(self, batched: BatchedEnvironment[Any]) -> None:
@@ -111,7 +116,7 @@ class GymVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Starts all episodes; one seed determines them all.
 
         Raises:
-            TsbenchError: `options`, of which there are none: episodes begin anew by themselves.
+            TsbenchError: `options` were given; none is supported.
         """
         if options:
             raise TsbenchError(f"reset takes no options, not {', '.join(options)}")

@@ -14,17 +14,17 @@ from tsbench.core.task import MDP, Task, plannable
 
 
 class Planning(MDP[S]):
-    """A task in which one samples states: s' = s + a.
+    """The planning variant of a task, in which an action changes the state directly: s' = s + a.
 
-    The reward is the task's own times the abstraction's `dynamics_reward`, so there is no second
-    reward that could drift away from the first.
+    The reward is the task's reward times the abstraction's `dynamics_reward`. Planning has no
+    reward of its own that could come to differ from the task's.
     """
 
-    seconds = 0.0  # in a physics engine: there is none
+    seconds = 0.0  # in a physics engine, which planning does not use
 
     def __init__(self, task: Task[S], *, explore: float = 0.0) -> None:
-        """`explore` is the share of episodes that begin at a sampled state instead of the start:
-        in kinematics any state can be visited at will, which is what makes planning easy.
+        """`explore` is the share of episodes that begin at a sampled state instead of the start. In
+        kinematics an episode can begin in any state, which makes exploration easy.
 
         Raises:
             TsbenchError: the task has no planning variant.
@@ -70,7 +70,7 @@ class Planning(MDP[S]):
 
     # Its dynamics, for BatchedEnvironment
 
-    diverged = np.zeros(0, int)  # there is no physics that could
+    diverged = np.zeros(0, int)  # kinematics cannot diverge
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
         start = self.abstraction.start(len(rows))
@@ -90,7 +90,11 @@ class Planning(MDP[S]):
 
 
 def naive_plan(task: Task[S]) -> Plan:
-    """The plan that a task's hand-made planner makes, without learning."""
+    """The plan of a task's hand-made planner (`Abstraction.naive`).
+
+    Raises:
+        TsbenchError: the task has no planning variant.
+    """
     planning = Planning(task)
     abstraction = planning.abstraction
     state = abstraction.start(1)

@@ -1,4 +1,4 @@
-"""MJCF to compiled models."""
+"""MJCF files and compiled models."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FOLDERS = (
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.])")
 
-# Kinds of warnings after which mujoco resets a simulation in its midst.
+# Kinds of warnings after which mujoco resets a simulation in the middle of an episode.
 UNSTABLE = [
     int(kind)
     for kind in (
@@ -34,10 +34,10 @@ UNSTABLE = [
 
 
 def model_path(name: str) -> Path:
-    """The hand-written MJCF of tsbench's own of that name.
+    """The path of tsbench's own MJCF `models/NAME.xml`.
 
     Raises:
-        TsbenchError: the installation lacks it.
+        TsbenchError: the installation lacks the file.
     """
     for folder in _FOLDERS:
         path = folder / f"{name}.xml"
@@ -47,13 +47,13 @@ def model_path(name: str) -> Path:
 
 
 def load_spec(name: str, package: str = OWN) -> mujoco.MjSpec:
-    """A MJCF, open to additions.
+    """A MJCF as a spec, to which a task can add.
 
     Args:
-        name: of the file `models/NAME.xml`.
-        package: that has the file, or a module in it. Meshes, textures and included files lie in
-            the same folder or below. They are handed over in memory: from a file, mujoco would
-            compile the folder's absolute path into the model.
+        name: NAME in the file name `models/NAME.xml`.
+        package: the package that contains the file, or a module of that package. Meshes, textures
+            and included files lie in the same folder or below. mujoco gets them in memory, because
+            it would compile the absolute path of a folder into the model.
 
     Raises:
         TsbenchError: there is no such file.
@@ -69,20 +69,21 @@ def load_spec(name: str, package: str = OWN) -> mujoco.MjSpec:
 
 @cache
 def compiled(name: str, package: str = OWN) -> mujoco.MjModel:
-    """A MJCF (see `load_spec`) as it is; for reading only."""
+    """The compiled model of a MJCF without additions (see `load_spec`). It is shared: do not change
+    it."""
     model: mujoco.MjModel = load_spec(name, package).compile()
     return model
 
 
 def fingerprint(spec: mujoco.MjSpec) -> str:
-    """Hash of a task's MJCF with what the task adds to it: the same under every mujoco, though
-    one may centre a mesh at 0 and the next at 1e-15."""
+    """Hash of a task's MJCF with the task's additions. Numbers are rounded to nine decimals, so
+    versions of mujoco that centre a mesh at 0 and at 1e-15 give the same hash."""
     text = _NUMBER.sub(lambda found: f"{round(float(found[0]), 9) + 0.0:g}", spec.to_xml())
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def compiled_hash(spec: mujoco.MjSpec) -> str:
-    """Hash of the compiled model, to the last bit; another mujoco compiles another."""
+    """Hash of the compiled model, to the last bit. It differs between versions of mujoco."""
     model = spec.compile()
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
@@ -90,7 +91,7 @@ def compiled_hash(spec: mujoco.MjSpec) -> str:
 
 
 def sensor_slices(model: mujoco.MjModel) -> dict[str, slice]:
-    """Where each sensor's values lie in `sensordata`."""
+    """The slice of `sensordata` that holds each sensor's values, by name of the sensor."""
     return {
         model.sensor(i).name: slice(
             int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i])

@@ -1,9 +1,8 @@
 """A task's full physics, of many episodes at once.
 
-It runs on `mujoco.batch`, which steps every simulation on a pool of threads that is as wide as the
-machine and then brings position and velocity sensors up to date. The bare `mujoco.rollout` leaves
-them one substep behind, and mending that takes an extra step. docs/speed.md says how near the whole
-comes to the bare rollout.
+It runs on `mujoco.batch`, which steps the simulations on a pool of threads, one per core, and then
+updates position and velocity sensors. `mujoco.rollout` would leave the sensors one substep behind,
+and updating them would take an extra step. docs/speed.md compares the speed of both.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from tsbench.sim.push import Push
 from tsbench.sim.quiet import QUIET
 
 _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
-_NUMBER = 1  # of a kind of warning, beside what it was about, in `Batch.warning`
+_NUMBER = 1  # index of the number of warnings of a kind in `Batch.warning`
 
 
 class Physics(Generic[S]):
@@ -35,12 +34,12 @@ class Physics(Generic[S]):
 
     Attributes:
         batch: the simulations.
-        push: what disturbs the episodes, or None.
+        push: the push that disturbs the episodes, or None.
         substeps: physics steps done so far, all episodes together.
-        warnings: how often mujoco has warned, of each kind (mjtWarning), all episodes together.
-        diverged: rows in which mujoco met a number that is not finite, or huge, in the last step.
-            mujoco itself resets such a simulation and goes on in its midst.
-        seconds: spent in mujoco so far, wall-clock.
+        warnings: number of mujoco warnings of each kind (mjtWarning), all episodes together.
+        diverged: rows in which mujoco met a huge or not finite number in the last step. mujoco
+            itself resets such a simulation and continues it, so the episode must end.
+        seconds: wall-clock time spent in mujoco so far.
     """
 
     def __init__(
@@ -122,7 +121,8 @@ class Physics(Generic[S]):
         return self.push.rows(rows).during(time, self.task.timestep)
 
     def warned(self) -> dict[str, int]:
-        """How often mujoco has warned, by mujoco's names; without those that never came."""
+        """Number of mujoco warnings by mujoco's name of their kind; kinds that never came are left
+        out."""
         return {
             mujoco.mjtWarning(kind).name: int(self.warnings[kind])
             for kind in np.flatnonzero(self.warnings)
@@ -142,7 +142,7 @@ class Physics(Generic[S]):
         self.warnings = snapshot["warnings"]
 
     def _read(self, rows: Any, time: np.ndarray, memory: np.ndarray) -> S:
-        # Copies: the batch's arrays change under whoever holds them.
+        # Copies, because the next step overwrites the batch's arrays.
         sensordata = self._sensordata[rows].copy()
         return self.plant.read(
             Readings(
@@ -157,7 +157,7 @@ class Physics(Generic[S]):
 
 @contextmanager
 def _computing() -> Iterator[None]:
-    """Silences mujoco's warnings, and tells in one line what it refuses to compute."""
+    """Silences mujoco's warnings, and turns its errors into a `TsbenchError`."""
     try:
         with QUIET:
             yield

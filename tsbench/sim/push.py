@@ -1,4 +1,4 @@
-"""Pushes: what disturbs an episode, the same in the batched and the dm_control environment."""
+"""Pushes that disturb an episode, equal in the batched and the dm_control environment."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def direction(plant: Plant[Any], heading: np.ndarray | float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Push:
-    """A constant force for a while on the body that a task lets be pushed (`Plant.pushed`), at its
-    centre of mass. One for all episodes, or, with a leading axis n everywhere, one for each.
+    """A constant force of limited duration on a task's pushed body (`Plant.pushed`), at its centre
+    of mass. One push for all episodes, or one for each, with a leading axis n in all fields.
 
     Attributes:
-        time: when it begins, in seconds since the start of the episode, shape () or (n,).
-        duration: seconds, shape () or (n,).
-        force: newtons in the world frame, shape (3,) or (n, 3).
+        time: begin in seconds since the start of the episode, shape () or (n,).
+        duration: duration in seconds, shape () or (n,).
+        force: force in newtons in the world frame, shape (3,) or (n, 3).
     """
 
     time: np.ndarray | float
@@ -34,7 +34,7 @@ class Push:
     force: np.ndarray
 
     def rows(self, rows: np.ndarray | slice) -> Push:
-        """The pushes of some members of the batch; a push for all is theirs too."""
+        """The pushes of some members of the batch; a push for all episodes is returned as it is."""
         if np.ndim(self.force) == 1:
             return self
         return Push(np.asarray(self.time)[rows], np.asarray(self.duration)[rows], self.force[rows])
@@ -42,12 +42,12 @@ class Push:
     def during(self, time: np.ndarray, timestep: float) -> np.ndarray:
         """The force in newtons over the control steps that begin at `time` (n,), shape (n, 3).
 
-        A step that the push covers only in part gets that share of its force, so that the whole
-        impulse, force times duration, arrives whatever the steps.
+        A step that the push covers in part gets that share of the force. The whole impulse, force
+        times duration, therefore does not depend on the time step.
         """
         begin = np.maximum(self.time, time)
         end = np.minimum(np.add(self.time, self.duration), time + timestep)
-        # Rounded, since times are sums: a step that is covered is covered exactly.
+        # Rounded, because times are sums with rounding errors: full cover must give exactly one.
         share = np.round(np.clip((end - begin) / timestep, 0.0, 1.0), 9)
         force: np.ndarray = share[..., None] * self.force
         return force

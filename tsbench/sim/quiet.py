@@ -1,4 +1,4 @@
-"""mujoco's warnings, which are counted and not written."""
+"""Suppression of mujoco's warnings, which tsbench counts instead."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import mujoco
 
 
 class Quiet:
-    """A context in which mujoco writes no warnings, whichever threads are in it.
+    """A context in which mujoco writes no warnings. Several threads may be in it at once.
 
-    Whoever computes in it counts the warnings (`Batch.warning`, `mjData.warning`). Outside, mujoco
-    writes each to the error stream, and to a file in the current directory. The handler is one for
-    the whole process: the first who enters replaces it, and the last who leaves puts it back.
+    The code in the context reads the counts of warnings (`Batch.warning`, `mjData.warning`).
+    Outside, mujoco writes each warning to the error stream and to a file in the current directory.
+    mujoco has one handler for the whole process: the first thread to enter the context replaces it,
+    and the last one to leave restores it.
     """
 
     def __init__(self) -> None:
@@ -36,7 +37,7 @@ class Quiet:
 
 
 def _ignore(message: str) -> None:
-    """What mujoco hands a warning to."""
+    """A handler of mujoco warnings that does nothing."""
 
 
 QUIET = Quiet()

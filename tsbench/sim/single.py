@@ -1,4 +1,4 @@
-"""One episode at a time as a `dm_control.rl.control.Environment`: what scores are made with."""
+"""One episode at a time, as a `dm_control.rl.control.Environment`."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ class Adapter(control.Task):
         expect_finite(np.array([self._steps]), self._previous, self._action)
 
     def get_observation(self, physics: dm_mujoco.Physics) -> OrderedDict[str, np.ndarray]:
-        return OrderedDict({control.FLAT_OBSERVATION_KEY: self.mdp.observation(self.state)[0]})
+        observation = self.mdp.observation(self.state)[0]  # may be a part of the state
+        return OrderedDict({control.FLAT_OBSERVATION_KEY: observation.copy()})
 
     def get_reward(self, physics: dm_mujoco.Physics) -> float:
         return float(self.mdp.reward(self._previous, self._action, self.state)[0])
@@ -78,7 +79,7 @@ class Adapter(control.Task):
 
     @abstractmethod
     def follow(self, physics: dm_mujoco.Physics) -> None:
-        """Sets `state` to what the step has led to."""
+        """Sets `state` to the state after the step."""
 
     def spared(self) -> int:
         """Steps that the arrival which ended the episode spares (`MDP.spared`), else zero."""
@@ -100,7 +101,7 @@ class PhysicsAdapter(Adapter):
     """A task, or its imitation variant, in full physics.
 
     Attributes:
-        push: what disturbs the episodes, or None.
+        push: the push that disturbs the episodes, or None.
     """
 
     def __init__(
@@ -184,11 +185,11 @@ class PlanningAdapter(Adapter):
 
 
 class ExactPhysics(dm_mujoco.Physics):
-    """dm_control's physics, but for two things.
+    """dm_control's physics with two changes.
 
-    What follows a reset: dm_control computes the first state with actuators disabled, which leaves
-    zero velocities for their damping in the first step. And what follows a step that could not be
-    computed: dm_control raises an error; here the episode ends, as it does among many.
+    After a reset the state is computed with actuators enabled. dm_control disables them, and their
+    damping would then see zero velocities in the first step. After a step that could not be
+    computed the episode ends, as in the batched environment. dm_control would raise an error.
 
     Attributes:
         diverged: whether the last step could not be computed.
@@ -201,7 +202,7 @@ class ExactPhysics(dm_mujoco.Physics):
 
     @contextmanager
     def check_invalid_state(self) -> Iterator[None]:
-        """What dm_control wraps every computation in."""
+        """The context of every computation of dm_control."""
         warnings = self.data.ptr.warning.number
         warnings[:] = 0
         with QUIET:
@@ -213,7 +214,7 @@ class StillPhysics(dm_mujoco.Physics):
     """A physics whose poses are set and never integrated.
 
     Attributes:
-        plan_timestep: seconds between two of them.
+        plan_timestep: seconds between two poses.
     """
 
     plan_timestep: float
@@ -233,8 +234,8 @@ def environment(
     push: Push | None = None,
     change: Change | None = None,
 ) -> control.Environment:
-    """One environment of a task or of its planning or imitation variant; in full physics, with a
-    push in every episode and with other physics if they are given."""
+    """One environment of a task or of its planning or imitation variant. `push` disturbs every
+    episode and `change` changes the physics; both have no effect on planning."""
     rng = np.random.default_rng(seed)
     if isinstance(mdp, Planning):
         physics = StillPhysics.from_model(MjModel(mdp.task.spec().compile()))

@@ -14,8 +14,8 @@ class Imitation(SimulatedTask[S]):
     Observations, actions and physics are the task's (P).
 
     Attributes:
-        task: that is imitated in.
-        tracker: what replaces the task's reward, start and ending.
+        task: the task whose observations, actions and physics are used.
+        tracker: the reward, start and ending that replace the task's.
     """
 
     def __init__(self, task: Task[S], reference: ReferenceMotion, form: str | None = None) -> None:
@@ -53,7 +53,7 @@ class Imitation(SimulatedTask[S]):
         return self.task.violated(state)
 
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
-        """Starts along the reference motion; perturbed, anywhere near the task's own start."""
+        """Starts along the reference motion or, if perturbed, near the task's own start."""
         if perturbed:
             return self.task.start(rng, count, perturbed=True)
         return self.tracker.start(rng, count)

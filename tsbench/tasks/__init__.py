@@ -42,16 +42,17 @@ def names() -> tuple[str, ...]:
 
 
 def refused() -> tuple[str, ...]:
-    """A line for each plug-in that cannot be imported, and for each name that several bring."""
+    """A line for each plug-in that cannot be imported, and for each name that several packages
+    bring."""
     several = [_ambiguous(name) for name, offers in _offers().items() if len(offers) > 1]
     return (*_broken().values(), *sorted(map(str, several)))
 
 
 def provider(name: str) -> Provider | None:
-    """The installed package that brings a task; None for a task that no installed package does.
+    """The installed package that brings a task, or None if no installed package brings it.
 
     Raises:
-        TsbenchError: several do.
+        TsbenchError: several packages bring a task of that name.
     """
     offers = _offers().get(name, {})
     if len(offers) > 1:
@@ -104,7 +105,7 @@ def _factory(name: str) -> Factory:
 
 
 def _offers() -> dict[str, dict[str, Factory]]:
-    """What is registered, without what comes from a package that cannot be imported whole."""
+    """The registered tasks, without those of packages of which a module cannot be imported."""
     broken = _broken()
     return {
         name: {package: make for package, make in offers.items() if package not in broken}
@@ -114,7 +115,8 @@ def _offers() -> dict[str, dict[str, Factory]]:
 
 @cache
 def _broken() -> dict[str, str]:
-    """Imports all tasks. Gives, for each package where that fails, a line that says why."""
+    """Imports all tasks. Returns a line with the reason for each package that cannot be
+    imported."""
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
     broken = {}

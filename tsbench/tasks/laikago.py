@@ -35,7 +35,7 @@ FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
 
 @dataclass(frozen=True)
 class Constants:
-    """What decides a score, beside the gait, the goal and the MJCF."""
+    """The constants that decide a score, besides the gait, the goal and the MJCF."""
 
     control_timestep: float = constant(1 / 30, "s", "P", "between actions")
     horizon: int = constant(180, "", "D", "control steps at the standard distance: 6 s")
@@ -75,11 +75,11 @@ class Constants:
 C = Constants()
 NOMINAL, HIPS = np.array(C.nominal), np.array(C.hips)
 
-# Of the planning variant. No score depends on them.
+# Constants of the planning variant, on which no score depends.
 COM_DECAY = -5.0  # 1/m, k_com, which the paper leaves out (D)
-# s (D). The paper names both 0.1 s and 60 steps. At 0.1 s the reward, a product of exponentials
-# per step, prefers plans that throw all feet forward at once every few steps and slide
-# (docs/calibration.md); at the control rate it prefers the gait.
+# s (D). The paper gives both 0.1 s and 60 steps. With steps of 0.1 s the reward prefers plans that
+# move all feet forward at once every few steps and slide; at the control rate it prefers the gait
+# (docs/calibration.md).
 PLAN_TIMESTEP = 1 / 30
 PLAN_REACH = 0.15  # m, how far a planned foot may be ahead of or behind its hip (D)
 PLAN_SIGHT = 0.5  # m, beyond which the planner does not see how far the goal is (D)
@@ -216,10 +216,10 @@ class Laikago(Plannable[LaikagoState]):
     def reward_terms(
         self, previous: LaikagoState, action: Array | None, state: LaikagoState
     ) -> dict[str, Array]:
-        """r_dist, r_ns, r_ee_z, r_ee_x, whose product is the reward, each shape (...,) (P).
+        """r_dist, r_ns, r_ee_z and r_ee_x, each of shape (...,). Their product is the reward (P).
 
         r_dist = exp(-2.5 |x - goal|), on the ground plane.
-        r_ns = exp(-10 sum c |e - e_prev|), horizontal, over the feet that were and are to stand.
+        r_ns = exp(-10 sum c |e - e_prev|), horizontal, over feet in stance before and after.
         r_ee_z = exp(-20 sum |z - zbar|), z at the sole, zbar 0 in stance and 0.10 m in swing.
         r_ee_x = exp(-4 sum |x - x_prev|), over all feet in the world frame.
         """
@@ -400,7 +400,8 @@ class Laikago(Plannable[LaikagoState]):
 
         Perturbed, all uniform: joints and the base's orientation per axis within `start_angle`,
         the base's velocity within `start_speed`, angular velocities within `start_spin`. The base
-        is raised by what tilt and bend can lower a sole at most: it may drop by some millimetres.
+        is raised by the most that tilt and bent joints can lower a sole, so that no sole starts in
+        the ground. The robot may then drop by some millimetres.
         """
         qpos = np.tile(compiled("laikago").key("home").qpos, (count, 1))
         qvel = np.zeros((count, 18))
@@ -475,7 +476,8 @@ class Laikago(Plannable[LaikagoState]):
         return tuple(range(first, min(first + cycle, self.horizon)))
 
     def ideal(self) -> LaikagoState:
-        """At top speed straight to the goal; feet at rest in stance, at even speed in swing."""
+        """The base moves straight to the goal at top speed. Feet rest in stance and move at
+        constant speed in swing."""
         steps = np.arange(self.horizon + 1)
         time = steps * self.timestep
         base_x = np.minimum(self.gait.base_speed * time, self.distance)
@@ -654,7 +656,7 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
     def sample(self, rng: Rng, count: int) -> LaikagoState:
         time = rng.integers(0, self.horizon, count) * PLAN_TIMESTEP
         base = rng.uniform([0.8, -0.1, PLAN_HEIGHT[0]], [1.0, 0.1, PLAN_HEIGHT[1]], (count, 3))
-        base[:, 0] *= self.gait.base_speed * time  # nearly as far as it could be by then
+        base[:, 0] *= self.gait.base_speed * time  # nearly as far as top speed allows by then
         ahead = rng.uniform(-PLAN_REACH / 2, PLAN_REACH / 2, (count, 4))
         return self.task.kinematic(time, base, base[:, :1] + HIPS[:, 0] + ahead)
 
@@ -688,7 +690,8 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         return state.feet[..., 0] - state.base_position[..., :1] - hips
 
     def naive(self, state: LaikagoState) -> Array:
-        """Straight ahead at top speed; stance feet stay, swing feet swing as fast as that."""
+        """Straight ahead at top speed. Stance feet rest, swing feet move as fast as that
+        requires."""
         xp = array_namespace(state.feet)
         gait, after = self.gait, state.time + PLAN_TIMESTEP
         stance = gait.contacts(state.time) & gait.contacts(after)
@@ -699,8 +702,8 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         return xp.concat([ahead, 0.0 * ahead, 0.0 * ahead, step], axis=-1)
 
     def observation(self, state: LaikagoState) -> Array:
-        """Far from the goal its distance is hidden: the gait that pays near it, where alone the
-        reward can be felt, is then the gait everywhere."""
+        """Beyond `PLAN_SIGHT` the distance of the goal is hidden. The reward is noticeable only
+        near the goal; the hidden distance makes the gait learned there apply everywhere."""
         xp = array_namespace(state.base_position)
         distance = self.task.goal_distance(state)[..., None]
         contacts = [
@@ -795,7 +798,7 @@ class LaikagoTracker(Tracker[LaikagoState]):
             rng, reference.qpos[frames], reference.qvel[frames], scale=0.5
         )
         standing = self.task.start(rng, count, perturbed=True)
-        first = rng.uniform(size=count) < 0.25  # evaluation starts here: practise it more
+        first = rng.uniform(size=count) < 0.25  # the starts of evaluation, trained more often
         qpos[first], qvel[first] = standing.qpos[first], standing.qvel[first]
         time = np.where(first, 0.0, frames * reference.timestep)
         return Start(time, qpos, qvel, filter_memory(qpos[:, 7:]))
@@ -825,7 +828,7 @@ def motors() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def filter_memory(joints: np.ndarray) -> np.ndarray:
-    """The filter's history of a robot that has long stood with these joint angles (n, 12)."""
+    """The settled filter memory (n, 48) of a robot that stands with joint angles (n, 12)."""
     return np.tile(joints - NOMINAL, 4)
 
 

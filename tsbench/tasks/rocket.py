@@ -28,7 +28,7 @@ from tsbench.tasks import register
 
 @dataclass(frozen=True)
 class Constants:
-    """What decides a score, beside the goal, the obstacles and the MJCF."""
+    """The constants that decide a score, besides the goal, the obstacles and the MJCF."""
 
     control_timestep: float = constant(1 / 50, "s", "P", "of control and simulation")
     main_thrust: float = constant(50.0, "N", "P", "of the main engine, per unit of action")
@@ -62,13 +62,13 @@ C = Constants()
 # The paper prints degrees; spec section 1 says why this is in radians.
 PLAN_TURN = 0.05  # rad per plan step (P, unit D)
 
-# Of the imitation reward. No score depends on them.
+# Constants of the imitation reward, on which no score depends.
 TRACKING_DECAY = -0.625  # k_imi (P)
 TRACKING_PENALTY = 0.25  # of a collision (P)
-TRACKING_ARRIVAL = 1.0  # m, over which arriving is felt (C)
-TRACKING_ADVANCE = 1.0  # per metre that a step brings along the reference (C)
-# m a step (C): going faster than 10 m/s, twice the plan's speed, earns no more: such rockets
-# tumble when they brake. Going back costs what it costs: no rocket does 25 m/s.
+TRACKING_ARRIVAL = 1.0  # m, decay length of the reward for arriving (C)
+TRACKING_ADVANCE = 1.0  # per metre of progress along the reference (C)
+# m per step (C). Progress above 10 m/s, twice the plan's speed, earns no more, because faster
+# rockets tumble when they brake. The limit for going back, 25 m/s, is faster than any rocket.
 TRACKING_LIMITS = (-0.5, 0.2)
 
 FLAMES = (  # from the nozzles in models/rocket.xml; a positive side force leaves on the right
@@ -105,7 +105,7 @@ def wrap(angle: Array) -> Array:
 
 @dataclass(frozen=True)
 class Rocket(Plannable[RocketState]):
-    """Navigation when there are no obstacles.
+    """The rocket task; without obstacles it is pure navigation.
 
     Attributes:
         distance: of the goal from the start in metres.
@@ -336,13 +336,13 @@ class Rocket(Plannable[RocketState]):
 
     @property
     def push_steps(self) -> tuple[int, ...]:
-        """Spread evenly over the planner's flight: there is no cycle whose phases could matter,
-        but there are a take-off, obstacles and an arrival."""
+        """Steps spread evenly over the planner's flight time, so that pushes meet take-off,
+        obstacles and arrival. A flight has no cycle whose phases could matter."""
         flight = self.horizon / C.horizon_ratio
         return tuple(int((index + 0.5) * flight / C.pushes) for index in range(C.pushes))
 
     def ideal(self) -> RocketState:
-        """At the planner's speed along each axis until there."""
+        """Along each axis at the planner's speed until the goal's coordinate is reached."""
         steps = np.arange(self.horizon + 1)
         travelled = C.plan_step / C.plan_timestep * self.timestep * steps
         position = np.minimum(travelled[:, None], self.goal)
@@ -448,7 +448,7 @@ class RocketAbstraction(Abstraction[RocketState]):
         return xp.concat([state.position, state.angle[..., None]], axis=-1)
 
     def naive(self, state: RocketState) -> Array:
-        """Straight at the goal, past nothing."""
+        """Straight at the goal, without avoiding obstacles."""
         xp = array_namespace(state.position)
         offset = (like(state.position, self.task.goal) - state.position) / C.plan_step
         longest = xp.max(xp.abs(offset), axis=-1)[..., None]
@@ -460,13 +460,13 @@ class RocketAbstraction(Abstraction[RocketState]):
 
 
 class RocketTracker(Tracker[RocketState]):
-    """Rewards for following the reference's path, whatever the time.
+    """Rewards for following the path of the reference motion, independent of time.
 
     `paper`: exp(k_imi |x - xbar|) R(s) - 0.25 I_collision, xbar the path's nearest point (P).
     `progress`: the same with the sparse R replaced by 0.1 + 0.5 s / L + 0.4 exp(-(L - s) / 1 m),
     where s of the path's length L lies before xbar, and 1 for each metre by which the step raised
-    s, up to 0.2 m (D). docs/calibration.md says what each part is for. Going forth gains at most
-    what going back has lost: to and fro does not pay.
+    s, up to 0.2 m (D). docs/calibration.md gives the reason for each part. Going forward gains at
+    most what going back has lost, so moving to and fro does not pay.
     """
 
     def __init__(self, task: Rocket, reference: ReferenceMotion, form: str) -> None:
@@ -477,7 +477,7 @@ class RocketTracker(Tracker[RocketState]):
         best = 1.0 + TRACKING_ADVANCE * TRACKING_LIMITS[1]
         self.max_reward = task.max_reward if form == "paper" else best
         remaining = np.linalg.norm(reference.qpos[:, :2] - task.goal, axis=-1)
-        # The rest is hovering.
+        # The reference hovers after its arrival, so the path ends there.
         self._arrival = int(np.argmax(remaining < remaining.min() + 0.05))
         self._path = Path.through(reference.qpos[: max(self._arrival, 1) + 1, :2])
 
@@ -501,14 +501,14 @@ class RocketTracker(Tracker[RocketState]):
 
     def start(self, rng: Rng, count: int) -> Start:
         reference, arrival = self.reference, self._arrival
-        # More often near the goal, where to stay pays and an early policy does not get.
+        # More often near the goal: staying there pays, but an early policy does not get there.
         frames = arrival - ((arrival + 1) * rng.uniform(size=count) ** 2).astype(int)
         qpos = reference.qpos[frames].copy()
         qvel = reference.qvel[frames] * rng.uniform(0.0, 1.0, (count, 1))
         qpos[:, 2] = rng.uniform(-0.5, 0.5, count)
         qvel[:, 2] = 0.0
         from_start = self.task.start(rng, count)
-        first = rng.uniform(size=count) < 0.25  # evaluation starts here: practise it more
+        first = rng.uniform(size=count) < 0.25  # the start of evaluation, trained more often
         qpos[first], qvel[first] = from_start.qpos[first], from_start.qvel[first]
         time = np.where(first, 0.0, frames * reference.timestep)
         return Start(time, qpos, qvel, from_start.memory)

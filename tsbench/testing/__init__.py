@@ -1,6 +1,6 @@
-"""Contract tests for whoever adds a task or a method; tsbench's own run the same ones.
+"""Contract tests for packages that add a task or a method. tsbench's own tests use them too.
 
-A test file of a package that brings a task with a planning variant, and a method:
+The test file of a package with one task, which has a planning variant, and one method:
 
 from tsbench.testing import ArrayContract, MethodContract, PlanningContract, TaskContract
 
@@ -24,7 +24,7 @@ class TestLazy(MethodContract):
 
 import pytest
 
-# Before they are imported: without it their assertions do not tell what was found.
+# It must come before the imports, or failing assertions do not show their values.
 pytest.register_assert_rewrite(
     "tsbench.testing.arrays", "tsbench.testing.contracts", "tsbench.testing.episodes"
 )

@@ -1,7 +1,8 @@
-"""Every function of a task on arrays of another library, data type and device.
+"""Calls every function of a task on arrays of another library, data type and device.
 
-On float32 tensors of torch each gives float32, within 1e-4 of what float64 arrays of numpy give. On
-torch's meta device, whose tensors have no values, each runs to its end: nothing moves to the host.
+On float32 tensors of torch each function returns float32, within 1e-4 of its result on float64
+arrays of numpy. Each function also runs on torch's meta device, whose tensors have no values: that
+shows that no array moves to the host.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from tsbench.testing.episodes import reference_of
 
 COUNT = 48
 STEPS = 20
-Call = tuple[str, Callable[..., Any], tuple[Any, ...]]  # its name, a function, its arguments
+Call = tuple[str, Callable[..., Any], tuple[Any, ...]]  # a name, a function, its arguments
 
 
 def converted(value: Any, convert: Callable[[np.ndarray], Any]) -> Any:
-    """The same with every array converted, whatever holds it."""
+    """A copy of nested states, readings and mappings with every array in them converted."""
     if isinstance(value, np.ndarray):
         return convert(value)
     if isinstance(value, (Batch, Readings)):
@@ -44,7 +45,7 @@ def converted(value: Any, convert: Callable[[np.ndarray], Any]) -> Any:
 
 
 def single(values: np.ndarray) -> np.ndarray:
-    """Float64 that float32 can hold, so that only the arithmetic differs."""
+    """Values rounded to float32, in float64, so that only the arithmetic differs."""
     return values.astype(np.float32).astype(float) if values.dtype.kind == "f" else values
 
 
@@ -72,7 +73,8 @@ def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def calls(task: Task[Any], reference: ReferenceMotion | None) -> Iterator[Call]:
-    """What there is to call, on states from an episode of random actions."""
+    """Every function of a task and its planning variant, with arguments from an episode of random
+    actions."""
     rng = np.random.default_rng(0)
     physics: Physics[Any] = Physics(task, COUNT, threads=1, perturbed=True)
     state = physics.begin(rng, np.arange(COUNT))
@@ -148,8 +150,10 @@ def all_calls(name: str) -> list[Call]:
 
 
 class ArrayContract:
-    """Attributes:
-    names: of the tasks that the contract is for.
+    """Tests that a task's functions keep the library, data type and device of their arrays.
+
+    Attributes:
+        names: the tasks to test.
     """
 
     names: ClassVar[Sequence[str]] = ()

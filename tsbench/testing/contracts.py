@@ -1,4 +1,4 @@
-"""What every task, every variant of one and every method promises, whatever it is about."""
+"""Contract tests: the promises that every task, every variant and every method keeps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Regime = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 REGIMES: dict[str, Regime] = {
     "uniform": lambda rng, shape: rng.uniform(-1.0, 1.0, shape),
     "small": lambda rng, shape: 0.1 * rng.normal(size=shape),
-    # Smooth, and now and then outside the box.
+    # Smooth, and at times outside the box [-1, 1].
     "wandering": lambda rng, shape: np.cumsum(0.3 * rng.normal(size=shape), axis=0),
     "zero": lambda rng, shape: np.zeros(shape),
 }
@@ -52,19 +52,19 @@ REGIMES: dict[str, Regime] = {
 
 @cache
 def played(case: Case) -> tuple[dm_env.Environment, list[list[dm_env.TimeStep]]]:
-    """Some episodes under random actions."""
+    """An environment, and four episodes in it under random actions."""
     environment = case.load()
     policy = at_random(environment, 7)
     return environment, [list(episode(environment, policy)) for _ in range(4)]
 
 
 class Contract:
-    """What an environment promises: a task, or a variant of one.
+    """Tests of the environment of a task or of its variants.
 
     Attributes:
-        names: of the tasks that the contract is for.
-        variants: of them that it is for.
-        least_reward: of a step, over all of them.
+        names: the tasks to test.
+        variants: the variants to test; None is the task itself.
+        least_reward: the least reward that a step of any of them can have.
     """
 
     names: ClassVar[Sequence[str]] = ()
@@ -108,7 +108,7 @@ class Contract:
         assert environment.control_timestep() == pytest.approx(timestep, rel=1e-12)
 
     def test_episodes(self, case: Case) -> None:
-        """First, then rewards within their bounds, then a last step that says why it is so."""
+        """A first step, rewards within their bounds, and a last step with discount 0 or 1."""
         environment, episodes = played(case)
         most = mdp(environment).max_reward
         for time_steps in episodes:
@@ -124,7 +124,7 @@ class Contract:
 
     @pytest.mark.parametrize("action", [-1.0, 0.0, 1.0, None])
     def test_discount_tells_endings_apart(self, case: Case, action: float | None) -> None:
-        """0 at a terminal state, 1 at the last step, which comes when the horizon says."""
+        """The discount is 0 at a terminal state and 1 at the horizon's last step."""
         environment = case.load(seed=3, perturbed=False)
         steady = np.full(mdp(environment).action_size, action or 0.0)
         policy = at_random(environment, 3) if action is None else lambda: steady
@@ -152,13 +152,13 @@ class Contract:
         if case.variant == "planning":
             assert len(distinct) == 1
         else:
-            assert len(distinct) >= 6  # an imitation's start is now and then the task's own
+            assert len(distinct) >= 6  # some imitation episodes begin at the task's own start
         if case.variant is None:
             fixed = [values(case.load(seed=seed, perturbed=False).reset()) for seed in (1, 2)]
             np.testing.assert_array_equal(fixed[0], fixed[1])
 
     def test_observations_are_not_shared(self, case: Case) -> None:
-        """Each is the caller's own: what he does to it changes nothing."""
+        """Each observation belongs to the caller, who may change it without effect on the next."""
         environment, untouched = case.load(seed=2), case.load(seed=2)
         policy, same = at_random(environment, 2), at_random(environment, 2)
         seen: list[np.ndarray] = []
@@ -187,7 +187,7 @@ class Contract:
             one, other = wild.step(action), tame.step(np.clip(action, -1.0, 1.0))
             np.testing.assert_array_equal(values(one), values(other))
             assert (one.reward, one.discount) == (other.reward, other.discount)
-        assert beyond > 7 * len(action)  # of fifteen times as many
+        assert beyond > 7 * len(action)  # about half of all entries lay outside the box
 
     def test_the_next_episode_begins_by_itself(self, case: Case) -> None:
         environment = case.load()
@@ -198,7 +198,7 @@ class Contract:
         assert environment.step(policy()).mid()
 
     def test_batched(self, case: Case) -> None:
-        """The batched environment of the same case: shapes, types, several episodes on end."""
+        """Shapes and data types of the batched environment of the same case."""
         environment = tsbench.load_batched(
             case.name, case.variant, count=3, reference=case.reference, threads=1, seed=0
         )
@@ -214,7 +214,7 @@ class Contract:
 
 
 class TaskContract(Contract):
-    """What a task promises, in full physics."""
+    """Tests of a task in full physics."""
 
     variants = (None,)
 
@@ -236,7 +236,7 @@ class TaskContract(Contract):
                 assert changed != task
 
     def test_its_configuration_can_be_run(self, name: str) -> None:
-        """With a budget of seconds and the one that `tsbench run` takes when none is given."""
+        """It has the budget `smoke` and the default budget, and every budget can be prepared."""
         chosen = config.compose([f"task={name}"])
         assert chosen.task.name == name
         assert {"smoke", chosen.budget} <= set(chosen.task.budgets)
@@ -260,7 +260,7 @@ class TaskContract(Contract):
         assert 0.0 < best_return(task) <= task.max_reward * task.horizon * (1.0 + 1e-12)
 
     def test_it_can_be_scored(self, name: str) -> None:
-        """Doing nothing: finite figures, and the same ones again."""
+        """Two evaluations of zero actions give the same finite figures."""
         task = tasks.make(name)
         scores = [evaluate(zero(task), task, protocol=SMOKE, threads=1) for _ in range(2)]
         assert scores[0] == scores[1]
@@ -269,14 +269,14 @@ class TaskContract(Contract):
 
     @pytest.mark.parametrize("regime", REGIMES)
     def test_both_simulations_agree_to_the_last_bit(self, name: str, regime: str) -> None:
-        """Over whole episodes, from perturbed starts."""
+        """dm_control and the batched simulation, over whole episodes from perturbed starts."""
         task, rng = tasks.make(name), np.random.default_rng(11)
         starts = task.start(rng, 3, perturbed=True)
         compare(task, starts, REGIMES[regime](rng, (task.horizon, 3, task.action_size)))
 
 
 class PlanningContract(Contract):
-    """What a task with a planning variant promises beyond: that variant, and the imitation one."""
+    """Tests of a task's planning variant and imitation variant."""
 
     variants = tsbench.VARIANTS
 
@@ -291,7 +291,7 @@ class PlanningContract(Contract):
             assert (subject.timestep, subject.plant) == (task.timestep, task)
 
     def test_states_can_be_sampled(self, name: str) -> None:
-        """What a planner could pass, and what it sees and stores of it."""
+        """Sampled planning states, their observations and coordinates have the right shapes."""
         planning = Planning(tasks.make(name))
         abstraction = planning.abstraction
         state = abstraction.sample(np.random.default_rng(0), 20)
@@ -335,14 +335,14 @@ class PlanningContract(Contract):
 
 @dataclass
 class Desk:
-    """A workspace that remembers what it is told.
+    """A workspace that records what a method reports.
 
     Attributes:
-        directory: for what the method leaves.
-        stages: their names and budgets.
-        reports: the steps that each stage reported.
-        substeps: of the physics, by stage.
-        notes: in plain words.
+        directory: the folder for the method's files.
+        stages: name and budget of each stage.
+        reports: the steps at each report, by stage.
+        substeps: physics substeps, by stage.
+        notes: the lines for the user.
     """
 
     directory: Path
@@ -382,19 +382,19 @@ class Scribe:
 
 
 def bits(policy: Policy) -> bytes:
-    """All that a policy's actions depend on."""
+    """The bytes of all arrays that a policy's actions depend on."""
     arrays = (policy.mean, policy.scale, *policy.weights, *policy.biases)
     return b"".join(array.tobytes() for array in arrays)
 
 
 class MethodContract:
-    """What a method promises.
+    """Tests of a method.
 
     Attributes:
-        names: of the methods that the contract is for.
-        task: that they are tried on.
-        constants: of it.
-        budget: that they are given.
+        names: the methods to test.
+        task: the task that they train on.
+        constants: changed constants of that task.
+        budget: the budget that they get.
         training: changes to the PPO settings, by kind of stage.
     """
 
@@ -413,7 +413,7 @@ class MethodContract:
             metafunc.parametrize("name", self.names)
 
     def problem(self, seed: int, **options: Any) -> Problem:
-        """The task, with a budget of a second or two."""
+        """The problem to train on, which takes a second or two."""
         task = tasks.make(self.task, **self.constants)
         return Problem(task, self.budget, self.training, options, seed, threads=1)
 
@@ -424,7 +424,7 @@ class MethodContract:
         assert "\n" not in summary
 
     def test_its_options_are_in_its_configuration(self, name: str) -> None:
-        """Where `key=value` and `--cfg job` find them."""
+        """`key=value` words and `--cfg job` find a method's options in its configuration file."""
         options = methods.find(name).Options
         assert options() == options()
         chosen = config.compose([f"task={self.task}", f"method={name}"]).method
@@ -435,8 +435,8 @@ class MethodContract:
             methods.find(name).train(self.problem(0, no_such_option=1), Desk(tmp_path))
 
     def test_its_policy_fits_and_repeats(self, name: str, tmp_path: Path) -> None:
-        """The same bits under a seed, from the disk too; and no stage overruns its budget by more
-        than one rollout."""
+        """One seed gives one policy, to the bit and after saving and loading. No stage exceeds its
+        budget by more than one rollout."""
         policies = []
         for attempt in ("first", "second"):
             desk, given = Desk(tmp_path / attempt), self.problem(1, name=name)

@@ -1,4 +1,4 @@
-"""Whole episodes to look at: by dm_control, by the batched simulation, and whether they agree."""
+"""Whole episodes by dm_control and by the batched simulation, and a comparison of the two."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ Actions = Callable[[], np.ndarray]  # the action of each step in turn
 
 @cache
 def plan_of(name: str) -> Plan:
-    """The plan that a task's hand-made planner makes."""
+    """The plan of a task's hand-made planner."""
     return naive_plan(tasks.make(name))
 
 
 @cache
 def reference_of(name: str) -> ReferenceMotion:
-    """That plan as full poses."""
+    """The plan of a task's hand-made planner as full poses."""
     return plannable(tasks.make(name)).reference(plan_of(name))
 
 
@@ -42,7 +42,7 @@ def plannable_tasks() -> tuple[str, ...]:
 
 @cache
 def one_of_each_kind() -> tuple[str, ...]:
-    """A task of each class with a planning variant, for tests that would be too long on all."""
+    """One task of each class with a planning variant, for tests that are too slow for all tasks."""
     kinds: dict[type, str] = {}
     for name in plannable_tasks():
         kinds.setdefault(type(tasks.make(name)), name)
@@ -51,11 +51,11 @@ def one_of_each_kind() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Case:
-    """A task, or a variant of it.
+    """A task or one of its variants.
 
     Attributes:
-        name: of the task.
-        variant: as `tsbench.load` takes it.
+        name: name of the task.
+        variant: the variant, as `tsbench.load` takes it.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Case:
         return reference_of(self.name) if self.variant == "imitation" else None
 
     def load(self, seed: int = 0, *, perturbed: bool = True) -> dm_env.Environment:
-        """With random starts where there are any, unless told otherwise."""
+        """The environment, with random starts if the case has them and `perturbed` is true."""
         return tsbench.load(
             self.name,
             self.variant,
@@ -80,12 +80,12 @@ class Case:
 
 
 def mdp(environment: dm_env.Environment) -> Any:
-    """The task or variant that an environment is about."""
+    """The task or variant of an environment."""
     return cast(Adapter, environment.task).mdp
 
 
 def state_of(environment: dm_env.Environment) -> Any:
-    """The state that an environment is in, with a batch axis of length one."""
+    """The present state of an environment, with a batch axis of length one."""
     return cast(Adapter, environment.task).state
 
 
@@ -96,7 +96,7 @@ def values(time_step: dm_env.TimeStep) -> np.ndarray:
 
 
 def episode(environment: dm_env.Environment, policy: Actions) -> Iterator[dm_env.TimeStep]:
-    """The time steps of a new episode. Fails when it goes on beyond the horizon."""
+    """The time steps of a new episode. It fails if the episode exceeds the horizon."""
     time_step = environment.reset()
     yield time_step
     for _ in range(mdp(environment).horizon):
@@ -108,19 +108,19 @@ def episode(environment: dm_env.Environment, policy: Actions) -> Iterator[dm_env
 
 
 def at_random(environment: dm_env.Environment, seed: int) -> Actions:
-    """Uniform actions."""
+    """A policy of uniform random actions in [-1, 1]."""
     rng = np.random.default_rng(seed)
     size = environment.action_spec().shape
     return lambda: rng.uniform(-1.0, 1.0, size)
 
 
 def ending(environment: dm_env.Environment, policy: Actions) -> bool:
-    """Plays an episode, whose ending has to be one of the two that there are: 0 as discount at a
-    terminal state, 1 at the horizon's last step. Whether it was terminal."""
+    """Plays an episode, and checks that its discount ends at 0 in a terminal state or at 1 at the
+    horizon's last step. Returns whether the last state was terminal."""
     subject = mdp(environment)
     steps, last = 0, None
     for time_step in episode(environment, policy):
-        if time_step.first():  # an imitation begins anywhere along its reference
+        if time_step.first():  # an imitation episode may begin anywhere along its reference
             steps = round(float(state_of(environment).time[0]) / subject.timestep)
         else:
             steps += 1
@@ -140,7 +140,7 @@ def same(first: State, second: State) -> bool:
 
 @dataclass
 class Placed:
-    """A task whose episodes begin where the test says."""
+    """A task whose episodes begin at the given starts."""
 
     task: SimulatedTask[Any]
     starts: Start
@@ -167,8 +167,8 @@ def play_batched(
 
 
 def compare(task: SimulatedTask[Any], starts: Start, actions: np.ndarray) -> list[int]:
-    """Plays `actions` (T, rows, a) from `starts` by the batched simulation and by dm_control, which
-    have to agree to the last bit. The steps at which the episodes end."""
+    """Plays `actions` (T, rows, a) from `starts` by the batched simulation and by dm_control, and
+    checks that both agree to the last bit. Returns the steps at which the episodes end."""
     states, rewards = play_batched(task, starts, actions, threads=2)
     observations = [task.observation(state) for state in states]
     ends = []

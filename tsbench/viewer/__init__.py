@@ -1,1 +1,1 @@
-"""Seeing a motion: MuJoCo models in meshcat, and pages that anyone can open."""
+"""The viewer: motions of MuJoCo models in meshcat, as pages, videos and pictures."""

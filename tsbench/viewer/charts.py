@@ -38,9 +38,9 @@ def svg(figure: Figure, name: str, timed: Sequence[Axes] = ()) -> str:
     """A figure as an element of an HTML page.
 
     Args:
-        figure: what to draw.
-        name: of the chart, unique in the page.
-        timed: its panels whose x axis is the show's time; on them the page draws a playhead.
+        figure: the figure.
+        name: name of the chart, unique in the page.
+        timed: panels whose x axis is the show's time; the page draws a playhead on them.
     """
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": name}):
         text = io.StringIO()
@@ -58,7 +58,7 @@ def svg(figure: Figure, name: str, timed: Sequence[Axes] = ()) -> str:
 
 
 def contacts(bands: Sequence[Band], duration: float) -> str:
-    """When each foot was to stand and stood, planned above executed."""
+    """The planned and the executed contact times of each foot, planned above executed."""
     figure, panel = _figure(0.34 * len(bands) + 0.7)
     for row, band in enumerate(bands):
         for spans, colour, low in (
@@ -73,7 +73,7 @@ def contacts(bands: Sequence[Band], duration: float) -> str:
 
 
 def rewards(recording: Recording, plan: Recording | None) -> str:
-    """The terms of each step's reward, and the whole."""
+    """The terms of each step's reward, and their combination."""
     names = list(recording.reward_terms)
     lines = [(EXECUTED_COLOUR, recording)]
     if plan is not None:
@@ -89,7 +89,7 @@ def rewards(recording: Recording, plan: Recording | None) -> str:
 
 
 def joints(recording: Recording, plan: Recording) -> str:
-    """The position of every joint of one degree of freedom, planned and executed."""
+    """The planned and executed position of every joint with one degree of freedom."""
     model = recording.task.spec().compile()
     lines: dict[str, list[Line]] = {}
     for index in range(model.njnt):
@@ -143,7 +143,7 @@ def robustness(surface: Surface, timestep: float) -> str:
 
 
 def learning(metrics: Path) -> str | None:
-    """Learning curves, None where there are none."""
+    """The learning curves, or None if the metrics hold no returns."""
     with matplotlib.rc_context(STYLE):
         figure = curves.figure(metrics)
     if figure is None:

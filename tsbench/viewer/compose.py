@@ -1,4 +1,4 @@
-"""From recordings to what is to be seen of them."""
+"""Makes shows from recordings."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from tsbench.viewer.show import (
 )
 from tsbench.viewer.stage import stage
 
-LANE = 2.0  # sizes of the robot between two that walk side by side
+LANE = 2.0  # robot sizes between two robots that are shown side by side
 
-EXECUTED_NOTE = "what the policy did, in full physics; its path is orange"
-PLAN_NOTE = "what it was to do, planned without physics; translucent"
-PAIR_NOTE = "what this policy did, in full physics; its path in this colour"
+EXECUTED_NOTE = "the policy's motion in full physics; its path is orange"
+PLAN_NOTE = "the planned motion, without physics; translucent"
+PAIR_NOTE = "this policy's motion in full physics; its path has this colour"
 
 STAND_PLANNED = Entry("planned contact", PLAN_COLOUR, "where a foot should stand now")
 STAND = Entry("contact", EXECUTED_COLOUR, "where a foot presses on the ground now")
 MASS = Entry("centre of mass", INK, "black dot, below the robot")
-PRESSURE = Entry("centre of pressure", PAPER, "white dot, where the ground pushes back")
-PUSH = Entry("push", PUSH_COLOUR, "a force from outside, while it lasts")
-FLAMES = Entry("flames", FLAME_COLOUR[:3], "as long as the engine is strong")
-GLOW = Entry("glow", (1.0, 0.75, 0.08), "where the reward can be felt; red is a penalty")
+PRESSURE = Entry("centre of pressure", PAPER, "white dot, mean point of the ground's pressure")
+PUSH = Entry("push", PUSH_COLOUR, "an external force, while it acts")
+FLAMES = Entry("flames", FLAME_COLOUR[:3], "their length shows the engine's throttle")
+GLOW = Entry("glow", (1.0, 0.75, 0.08), "reward at this place; red is a penalty")
 
 
 def compose(
@@ -53,12 +53,12 @@ def compose(
     verdict: str = "",
     summary: Sequence[tuple[str, str]] = (),
 ) -> Show:
-    """The show of one policy and the plan that it was to follow. Without a plan, the contacts
-    that the task's schedule asks for are shown where the feet are.
+    """The show of one policy and the plan that it follows. Without a plan, the scheduled contacts
+    are drawn below the feet of the robot.
 
     Args:
-        recording: what was executed.
-        plan: what was planned, as full poses.
+        recording: the executed motion.
+        plan: the planned motion.
         title, verdict, summary: see `Show`.
     """
     name, guide = "executed", plan or recording
@@ -111,11 +111,11 @@ def _plan_actor(plan: Recording) -> Actor:
 
 
 def compose_pair(first: Recording, second: Recording, *, title: str, verdict: str) -> Show:
-    """The show of two policies of one task, called A and B: on the ground side by side, in a flat
-    world, where there is no aside, on top of each other.
+    """The show of two policies of one task, called A and B. Robots with feet are shown side by
+    side, others at their own positions.
 
     Raises:
-        TsbenchError: they are for different tasks.
+        TsbenchError: the recordings are of different tasks or constants.
     """
     if first.task != second.task:
         constants = " with other constants" if first.task.name == second.task.name else ""
@@ -146,8 +146,12 @@ def compose_pair(first: Recording, second: Recording, *, title: str, verdict: st
 
 
 def spans(times: Array, on: NDArray[np.bool_]) -> list[list[float]]:
-    """[begin, end] of the times (K,) for which something held (K,); a time stands for the step
-    that begins there."""
+    """[begin, end] in seconds of the intervals in which a condition holds.
+
+    Args:
+        times: seconds at which steps begin, shape (K,).
+        on: whether the condition holds in each step, shape (K,).
+    """
     edges = np.diff(np.concatenate([[False], on, [False]]).astype(int))
     ends = np.append(times, times[-1])
     return [
@@ -157,7 +161,7 @@ def spans(times: Array, on: NDArray[np.bool_]) -> list[list[float]]:
 
 
 def foot_bands(planned: Recording, executed: Recording | None) -> list[Band]:
-    """When each foot was to be on the ground, by the clock of `planned`, and when it was."""
+    """The contact times of each foot: scheduled, at the times of `planned`, and executed."""
     drawing = planned.task.drawing()
     scheduled = planned.scheduled
     return [

@@ -18,7 +18,10 @@ def figure(metrics: Path) -> Figure | None:
     """The return against environment steps, one panel for each stage.
 
     Args:
-        metrics: a run's `metrics.jsonl`; without returns in it there is nothing to draw.
+        metrics: a run's `metrics.jsonl`.
+
+    Returns:
+        The figure, or None if the metrics hold no returns.
 
     Raises:
         TsbenchError: the file is damaged.
@@ -45,7 +48,7 @@ def figure(metrics: Path) -> Figure | None:
 
 
 def draw(metrics: Path, picture: Path) -> None:
-    """Writes them as a PNG, if there are any.
+    """Writes the learning curves as a PNG, if the metrics hold returns.
 
     Args:
         metrics: a run's `metrics.jsonl`.

@@ -30,21 +30,21 @@ Picture = NDArray[np.uint8]  # (height, width, 3)
 
 WIDTH, HEIGHT = 960, 540  # pixels of a video
 INSET = 240  # pixels, side of its close-up
-SMALL = 0.4  # the robot's share of half the picture's height below which there is a close-up
+SMALL = 0.4  # robot size over half the picture's height; below this a close-up is drawn
 FRAMES_PER_SECOND = 30
 CELL = 300  # pixels, side of a strip's picture
-MAX_SHAPES = 10_000  # in a picture
-TRAIL_PIECES = 120  # at most, of a path
-PATH_WIDTH = 0.0015  # of the distance from which it is seen
+MAX_SHAPES = 10_000  # in one picture
+TRAIL_PIECES = 120  # pieces of a drawn path, at most
+PATH_WIDTH = 0.0015  # width of a path over the distance from the camera
 FIELD_OF_VIEW = 35.0  # degrees
 TEXT = (29, 39, 51)  # red, green, blue of 255
 
 
 def write_video(show: Show, path: Path) -> None:
-    """Writes an MP4 at 30 frames a second, in real time, and its last second once more.
+    """Writes an MP4 in real time at 30 frames a second; its last frame stays for a second.
 
     Args:
-        show: what is to be seen.
+        show: the show to draw.
         path: a new file.
 
     Raises:
@@ -53,7 +53,7 @@ def write_video(show: Show, path: Path) -> None:
     _refuse(path, ".mp4")
     if imageio_ffmpeg is None:
         raise TsbenchError("videos need an encoder: pip install 'tsbench[video]' (imageio-ffmpeg)")
-    temporary = path.with_name(path.name + ".part.mp4")  # ffmpeg goes by the name's end
+    temporary = path.with_name(path.name + ".part.mp4")  # ffmpeg chooses the format by the ending
     with Camera(show, WIDTH, HEIGHT) as camera, _removed(temporary, path):
         writer = imageio_ffmpeg.write_frames(
             str(temporary), (WIDTH, HEIGHT), fps=FRAMES_PER_SECOND, quality=7, macro_block_size=4
@@ -66,13 +66,13 @@ def write_video(show: Show, path: Path) -> None:
 
 
 def write_strip(show: Show, path: Path, count: int = 6) -> None:
-    """Writes a PNG with `count` moments from left to right, a row for each actor: plan above
-    execution.
+    """Writes a PNG with `count` moments from left to right and a row for each actor, the plan
+    above the execution.
 
     Args:
-        show: what is to be seen.
+        show: the show to draw.
         path: a new file.
-        count: of moments.
+        count: number of moments.
 
     Raises:
         TsbenchError: no OpenGL works here, or the file exists or cannot be written.
@@ -103,7 +103,7 @@ def write_strip(show: Show, path: Path, count: int = 6) -> None:
 
 
 class Camera:
-    """Takes pictures of a show.
+    """Draws pictures of a show.
 
     Attributes:
         duration: seconds of the show.
@@ -112,7 +112,7 @@ class Camera:
     def __init__(self, show: Show, width: int, height: int) -> None:
         """
         Raises:
-            TsbenchError: no OpenGL works here, or a motion is not one of the show's model.
+            TsbenchError: no OpenGL works here, or a motion does not fit the show's model.
         """
         self.show = show
         self.tracks = [track(show.model, actor) for actor in show.actors]
@@ -134,7 +134,7 @@ class Camera:
         self._small.close()
 
     def frame(self, time: float) -> Picture:
-        """All of the show, with the robot once more in a corner where it is small, (H, W, 3)."""
+        """The whole scene at a time in seconds, (H, W, 3), with a close-up of a small robot."""
         width, height = self._large.width, self._large.height
         low, high = self.view.box
         centre = (low + high) / 2
@@ -148,14 +148,15 @@ class Camera:
         pen.text((16, height - 16), f"{time:.2f} s", TEXT, _font(18), anchor="ls")
         if self.view.size / (distance * math.tan(math.radians(FIELD_OF_VIEW / 2))) < SMALL:
             inset = self._close(self._small, everybody, everybody[0], time)
-            # Ground goes on at the top, where a flight's goal is.
+            # The close-up covers the top where there is ground, the bottom in a flat world, whose
+            # goal may be at the top.
             left, top = width - INSET - 12, height - INSET - 12 if self.view.flat else 12
             picture.paste(Image.fromarray(inset), (left, top))
             pen.rectangle((left, top, left + INSET, top + INSET), outline="white", width=2)
         return np.asarray(picture)
 
     def portrait(self, actor: Actor, time: float) -> Picture:
-        """One actor alone, seen closely, (H, W, 3)."""
+        """A close-up of one actor alone at a time in seconds, (H, W, 3)."""
         return self._close(self._large, [actor], actor, time)
 
     def _close(
@@ -212,8 +213,8 @@ class Camera:
 def _renderers(
     model: mujoco.MjModel, sizes: Sequence[tuple[int, int]]
 ) -> Iterator[mujoco.Renderer]:
-    """Renderers for pictures of some widths and heights, without shadows, which would take most
-    of the time where there is no graphics card.
+    """Renderers for pictures of the given widths and heights in pixels. They draw no shadows, which
+    would take most of the time without a graphics card.
 
     Raises:
         TsbenchError: no OpenGL works here.
@@ -221,7 +222,7 @@ def _renderers(
     for width, height in sizes:
         try:
             renderer = mujoco.Renderer(model, height, width, max_geom=MAX_SHAPES)
-        except Exception as error:  # each OpenGL has errors of its own
+        except Exception as error:  # each OpenGL library raises its own errors
             chosen = os.environ.get("MUJOCO_GL", "the default")
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise TsbenchError(f"OpenGL ({chosen}) draws no pictures here: {reason}") from error
@@ -230,7 +231,7 @@ def _renderers(
 
 
 def _index(times: Array, time: float) -> int:
-    """Of the last of the times (K,) that is not after this one."""
+    """The index of the last of the times (K,) that is not after `time`."""
     return max(int(np.searchsorted(times, time + 1e-9, side="right")) - 1, 0)
 
 
@@ -241,10 +242,10 @@ def _tint(geom: mujoco.MjvGeom, colour: Rgb) -> None:
 
 
 def _next(world: mujoco.MjvScene) -> mujoco.MjvGeom:
-    """A fresh geom at the scene's end.
+    """A new geom at the end of the scene.
 
     Raises:
-        TsbenchError: there is no room for one.
+        TsbenchError: the scene is full.
     """
     if world.ngeom >= world.maxgeom:
         raise TsbenchError(f"a picture holds at most {world.maxgeom} shapes")
@@ -280,7 +281,8 @@ def _add_prop(world: mujoco.MjvScene, prop: Prop, time: float) -> None:
 
 
 def _distance(view: Framing, target: Array, ratio: float) -> float:
-    """From where all of a show is seen in a picture that is `ratio` times as wide as high."""
+    """The camera's distance in metres from the target at which the whole show fits into a picture
+    with `ratio` of width to height."""
     forward = np.asarray(view.direction) / np.linalg.norm(view.direction)
     right = np.cross([0.0, 0.0, 1.0], forward)
     right /= np.linalg.norm(right)
@@ -303,9 +305,10 @@ def _bytes(colour: Rgb) -> tuple[int, int, int]:
 
 
 def _refuse(path: Path, ending: str) -> None:
-    """
+    """Checks the path of a new file.
+
     Raises:
-        TsbenchError: the file exists or cannot be made, or its name says that it is something else.
+        TsbenchError: the file exists or cannot be made, or its name has another ending.
     """
     if path.suffix.lower() != ending:
         raise TsbenchError(f"{path} must end in {ending}")
@@ -314,7 +317,7 @@ def _refuse(path: Path, ending: str) -> None:
 
 @contextlib.contextmanager
 def _removed(temporary: Path, path: Path) -> Iterator[None]:
-    """Leaves no half-written file.
+    """Removes the temporary file at the end, and names the file in errors.
 
     Raises:
         TsbenchError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Where the camera stands and how far it sees."""
+"""Places the camera: its direction, and the space that it shows."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from tsbench.viewer import scene
 from tsbench.viewer.scene import Array
 from tsbench.viewer.show import Landmark, Track
 
-FRAMED_POINTS = 60  # of each path that the camera makes sure to show
-PLANAR = 1e-6  # m, sideways movement of a planar motion
+FRAMED_POINTS = 60  # points of each path that must be in the picture
+PLANAR = 1e-6  # m, sideways movement below which a motion is planar
 
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """What the camera is to show, in world metres.
+    """The space that the camera shows; world frame, metres.
 
     Attributes:
-        size: how far the visible robot reaches around its base, the first body that can move.
-        above, below: the same upwards and downwards alone, about.
-        centres: of spheres to be seen, along the paths and at the landmarks, shape (S, 3).
-        radii: of the spheres, shape (S,).
-        direction: towards the camera.
-        flat: whether all happens in a vertical plane along x, with no ground to see it on.
+        size: radius of the visible robot around its base, the first body that can move.
+        above, below: approximate height of the robot above and depth below its base.
+        centres: centres of the spheres to show, along paths and at landmarks, shape (S, 3).
+        radii: radii of these spheres, shape (S,).
+        direction: vector from the target towards the camera.
+        flat: whether the motion stays in a vertical plane along x, and there is no ground.
     """
 
     size: float
@@ -40,13 +40,13 @@ class Framing:
 
     @property
     def box(self) -> tuple[Array, Array]:
-        """Lowest and highest corner of the box around the spheres."""
+        """Lowest and highest corner of the box around the spheres, each of shape (3,)."""
         radii = self.radii[:, None]
         return (self.centres - radii).min(axis=0), (self.centres + radii).max(axis=0)
 
     @property
     def extent(self) -> float:
-        """The diagonal of the box."""
+        """The length of the diagonal of the box."""
         low, high = self.box
         return float(np.linalg.norm(high - low))
 
@@ -54,14 +54,14 @@ class Framing:
 def framing(
     model: mujoco.MjModel, start: Array, tracks: Sequence[Track], marks: Sequence[Landmark]
 ) -> Framing:
-    """How to look at a motion: so that it goes from left to right.
+    """The framing in which a motion goes from left to right.
 
-    A motion within a vertical plane along x is looked at from the side, any other from the right,
-    ahead and above.
+    The camera sees a motion in a vertical plane along x from the side, and any other motion from
+    the right, ahead and above.
 
     Args:
         model: compiled model.
-        start: generalised positions at which the robot is measured, shape (nq,).
+        start: generalised positions at which the size of the robot is measured, shape (nq,).
         tracks: the motions, the most important one first.
         marks: goal and obstacles.
     """
@@ -86,7 +86,7 @@ def framing(
 
 
 def reach(model: mujoco.MjModel, qpos: Array) -> tuple[float, float, float]:
-    """How far the visible robot reaches around its base in metres: at all, above and below."""
+    """Radius of the visible robot around its base, and its height above and depth below, metres."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)

@@ -1,8 +1,8 @@
 """One self-contained HTML page that plays a motion: no server, no network.
 
-The page holds meshcat's viewer, the drawing commands that a meshcat server would have sent, and a
-small player (page.html) with captions. Nothing here starts a process or opens a port: a
-`Recorder` takes the place of meshcat's connection to its server.
+The page holds meshcat's viewer, the drawing commands that a meshcat server would send, and a small
+player (page.html) with captions. A `Recorder` replaces meshcat's connection to its server, so
+making a page starts no process and opens no port.
 """
 
 from __future__ import annotations
@@ -46,29 +46,29 @@ from tsbench.viewer.show import (
     track,
 )
 
-# Of meshcat's own scene: its point lights reach 10 m, too little for a rocket.
+# Parts of meshcat's own scene. Its point lights reach 10 m, too little for a rocket.
 UNWANTED = ("/Grid", "/Axes", "/Lights/PointLightNegativeX", "/Lights/PointLightPositiveX")
-# Of what the page holds: meshcat itself, then what is bundled with it.
+# The licences of meshcat and of the libraries bundled with it, which the page contains.
 LICENCES = (
     "LICENSE",
     "dist/main.min.js.LICENSE.txt",
     "dist/main.min.js.THIRD_PARTY_LICENSES.json",
 )
 
-TRAIL_SIDES = 6  # of the tube that is drawn along a path
-TRAIL_POINTS = 600  # at most, per path
-TRAIL_RADIUS = 0.004  # of the tube, relative to the robot
-# What page.html adds to the radius, relative to the distance from which it is seen. Where both
-# paths coincide the executed one covers the plan's.
+TRAIL_SIDES = 6  # sides of the tube along a path
+TRAIL_POINTS = 600  # points of a path, at most
+TRAIL_RADIUS = 0.004  # radius of the tube over the size of the robot
+# page.html adds this to the radius, times the distance from the camera. The executed path is wider,
+# so it covers the plan's where both coincide.
 EXECUTED_WIDTH, PLAN_WIDTH = 0.0015, 0.0011
-GRID_LINES = 5  # at least, across all that is seen
+GRID_LINES = 5  # lines across the picture, at least
 IDENTIFIER = re.compile(rb"[0-9a-f]{8}-[0-9a-f]{4}-1[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}")
-STILL = 1e-6  # m or quaternion units: what moves less is not animated
-JUMP = 1e-4  # s, in which a scale changes from one value to the next
+STILL = 1e-6  # m or quaternion units; a node that moves less is not animated
+JUMP = 1e-4  # s, the time of a jump from one scale to the next
 
 
 class Recorder:
-    """Takes the place of meshcat's `ViewerWindow`: keeps the commands instead of sending them."""
+    """Replaces meshcat's `ViewerWindow`, and keeps the commands instead of sending them."""
 
     def __init__(self) -> None:
         self.commands: list[dict[str, Any]] = []
@@ -77,10 +77,10 @@ class Recorder:
         self.commands.append(command.lower())
 
     def packed(self) -> list[str]:
-        """The commands as meshcat's page takes them, in base64.
+        """The commands in the format of meshcat's page, in base64.
 
-        meshcat's identifiers (time and network address of the machine) become running numbers:
-        equal motions give equal pages, which tell nothing of where they were made.
+        meshcat's identifiers hold the time and the machine's network address. They are replaced by
+        running numbers, so equal motions give equal pages, and a page does not reveal its machine.
         """
         numbers: dict[bytes, bytes] = {}
 
@@ -96,7 +96,7 @@ class Recorder:
 
 
 class Playback:
-    """meshcat's command that animates nodes, with typed arrays instead of a map per keyframe."""
+    """meshcat's command that animates nodes, with typed arrays in place of maps per keyframe."""
 
     def __init__(self, duration: float) -> None:
         self.duration = duration
@@ -110,8 +110,15 @@ class Playback:
         quaternion: Array,
         scale: Array | None = None,
     ) -> None:
-        """Animates one node: position (K, 3) and quaternion (w, x, y, z) (K, 4) at K times, and
-        from each time to the next scale (K, 3)."""
+        """Animates one node.
+
+        Args:
+            path: the node's path in meshcat's tree.
+            times: seconds, shape (K,).
+            position: metres, shape (K, 3).
+            quaternion: (w, x, y, z), shape (K, 4).
+            scale: held from each time to the next, shape (K, 3); None for no scaling.
+        """
         channels = [
             (".position", "vector3", times, position),
             (".quaternion", "quaternion", times, np.roll(quaternion, -1, axis=-1)),
@@ -140,7 +147,7 @@ class Playback:
 
 
 def _unit(vectors: Array) -> Array:
-    """Vectors (K, 3) at length 1; where a path turns back they may be 0, and stay so."""
+    """Vectors (K, 3) scaled to length 1. Zero vectors, as where a path turns back, stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
@@ -152,8 +159,8 @@ def trail(points: Array, radius: float) -> tuple[shapes.Geometry, NDArray[np.int
         radius: metres.
 
     Returns:
-        The tube and the indices of the points that it passes through, which leave out those where
-        the path has hardly got ahead. A path that stays in one place has one point and no tube.
+        The tube and the indices of the points that it passes through. Points too close to the one
+        before are left out. A path that stays in one place has one point and no tube.
     """
     travelled = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     spacing = max(0.5 * radius, travelled[-1] / TRAIL_POINTS)
@@ -162,7 +169,7 @@ def trail(points: Array, radius: float) -> tuple[shapes.Geometry, NDArray[np.int
     if len(path) < 2:
         return scene.surface(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))), kept
     tangent = np.gradient(path, axis=0)
-    # The direction in which a path spreads least hardly ever lies along it.
+    # The direction of least spread is rarely parallel to the path, so the cross product is defined.
     least = np.linalg.eigh(np.cov(path.T))[1][:, 0]
     side = _unit(np.cross(tangent, least))
     other = _unit(np.cross(tangent, side))
@@ -178,7 +185,7 @@ def trail(points: Array, radius: float) -> tuple[shapes.Geometry, NDArray[np.int
 
 
 def metric_grid(view: Framing) -> tuple[shapes.LineSegments, list[dict[str, Any]]]:
-    """Lines in round metres behind a flat motion, and the labels along two edges."""
+    """Lines at round numbers of metres behind a flat motion, and labels along two edges."""
     low, high = view.box
     power = 10.0 ** math.floor(math.log10(view.extent / GRID_LINES))
     step = max(factor * power for factor in (1, 2, 5) if factor * power <= view.extent / GRID_LINES)
@@ -205,13 +212,13 @@ def metric_grid(view: Framing) -> tuple[shapes.LineSegments, list[dict[str, Any]
 
 
 def css(colour: Sequence[float]) -> str:
-    """A colour as style sheets have it."""
+    """A colour in the notation of style sheets, #rrggbb."""
     return f"#{scene.hexadecimal(colour):06x}"
 
 
 def _entries(show: Show) -> Iterator[Entry]:
     yield from (Entry(actor.name, actor.colour, actor.note) for actor in show.actors)
-    for kind, note in (("goal", "where to go"), ("obstacle", "what to keep clear of")):
+    for kind, note in (("goal", "the position to reach"), ("obstacle", "to be avoided")):
         marks = [mark for mark in show.landmarks if mark.text.startswith(kind)]
         yield from (Entry(kind, mark.colour[:3], note) for mark in marks[:1])
     yield from show.legend
@@ -228,14 +235,14 @@ def _viewer_file(name: str) -> str:
 
 
 def fill(template: str, contents: dict[str, str]) -> str:
-    """A template of this package with `{{name}}` replaced, in one pass: contents are not searched
-    again."""
+    """A template of this package with each `{{name}}` replaced, in one pass: names within the
+    contents are not replaced."""
     text = importlib.resources.files("tsbench.viewer").joinpath(template).read_text("utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: contents[match[1]], text)
 
 
 def embedded(data: Any) -> str:
-    """JSON for a script element, which "<" could end."""
+    """JSON for a script element, with "<" escaped, which could end the element."""
     return json.dumps(data).replace("<", "\\u003c")
 
 
@@ -245,7 +252,7 @@ def _rows(summary: Sequence[tuple[str, str]]) -> Iterator[str]:
 
 
 def _set_stage(root: Visualizer, model: mujoco.MjModel, view: Framing) -> None:
-    """Sends what stands still: the place, without meshcat's own grid and lights."""
+    """Sends the static parts of the scene, and hides meshcat's own grid and lights."""
     for unwanted in UNWANTED:
         root[unwanted].set_property("visible", False)
     for side in ("top_color", "bottom_color"):
@@ -262,8 +269,8 @@ def _send_actor(
     playback: Playback,
     view: Framing,
 ) -> dict[str, Any]:
-    """Sends a robot, its path and its animation; returns what the player is told of them."""
-    own = actor.name.replace("/", ":")  # "/" parts meshcat's paths
+    """Sends a robot, its path and its animation; returns the robot's data for the player."""
+    own = actor.name.replace("/", ":")  # "/" separates the parts of meshcat's paths
     robot = [part for part in scene.parts(model) if part.body != 0]
     scene.draw(root[own], model, robot, (*actor.colour, GHOST_OPACITY) if actor.ghost else None)
     bodies = scene.moving_bodies(model)
@@ -286,19 +293,19 @@ def _send_actor(
             "node": f"meshcat/path/{own}/<object>",
             "times": np.where(actor.ghost, 0.0, motion.times[kept]).tolist(),
             "width": PLAN_WIDTH if actor.ghost else EXECUTED_WIDTH,
-            "indices": 6 * TRAIL_SIDES,  # of triangles, from one time to the next
+            "indices": 6 * TRAIL_SIDES,  # vertex indices between two times
         },
     }
 
 
 def _send_prop(root: Visualizer, prop: Prop, playback: Playback) -> None:
-    """Sends a prop and its animation; one that is never to be seen is left out."""
+    """Sends a prop and its animation. A prop that is never visible is left out."""
     if not prop.scale.any():
         return
     still = np.ptp(prop.scale, axis=0).max() <= STILL
     place = root["props"][prop.name]
     scene.draw_shape(place["shape"], prop.geom, prop.size, prop.colour)
-    # A scale that changes is the animation's: a matrix with a zero in it has no orientation.
+    # Only the animation sets a changing scale: a matrix scaled by zero has no orientation.
     first = prop.scale[0] if still else np.ones(3)
     place.set_transform(scene.placed(prop.position[0], prop.quaternion[0]) @ np.diag([*first, 1]))
     path = f"meshcat/props/{prop.name}"
@@ -306,7 +313,7 @@ def _send_prop(root: Visualizer, prop: Prop, playback: Playback) -> None:
 
 
 def _timeline(rows: Sequence[Band | Curve]) -> Iterator[dict[str, Any]]:
-    """Rows as the player draws them; numbers to four digits."""
+    """The rows of the timeline as data for the player, with numbers to four digits."""
     for row in rows:
         if isinstance(row, Band):
             yield {"text": row.text, "planned": row.planned, "executed": row.executed}
@@ -323,14 +330,14 @@ def _timeline(rows: Sequence[Band | Curve]) -> Iterator[dict[str, Any]]:
 
 
 def render(show: Show, *, served: bool = False) -> str:
-    """The page's text.
+    """The HTML text of the page.
 
     Args:
-        show: what is to be seen.
-        served: whether a server is there that can play the episode again with a push.
+        show: the show to draw.
+        served: whether a server can play the episode again with a push.
 
     Raises:
-        TsbenchError: a motion is not one of the show's model, or nothing in it can move.
+        TsbenchError: a motion does not fit the show's model, or no body of the model can move.
     """
     model, actors = show.model, show.actors
     if not scene.moving_bodies(model):

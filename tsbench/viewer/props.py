@@ -1,4 +1,4 @@
-"""What explains a motion: marks on the ground, arrows, flames."""
+"""Props that explain a motion: marks on the ground, arrows and flames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tsbench.viewer.show import (
 )
 
 FOOT_MARK = 0.045  # m, radius of the disc under a foot
-PUSH_LENGTH = 0.008  # m per newton of a push's arrow, within 0.6 to 2 sizes of the robot
+PUSH_LENGTH = 0.008  # m per newton, length of a push's arrow within 0.6 to 2 robot sizes
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -44,7 +44,8 @@ def _disc(
     places: Array,
     on: NDArray[np.bool_],
 ) -> Prop:
-    """A mark on the ground below places (K, 3), where `on` (K,). Levels lie on one another."""
+    """A disc on the ground below the places (K, 3), visible while `on` (K,) is true. A disc of a
+    higher level covers one of a lower level."""
     height = 0.001 * level
     position = places.copy()
     position[:, 2] = height
@@ -62,7 +63,7 @@ def _disc(
 
 
 def planned_marks(actor: str, recording: Recording) -> list[Prop]:
-    """A disc below each foot that is to be on the ground, wider than that of one that is."""
+    """A disc below each foot while it is scheduled to stand, wider than a contact mark."""
     scheduled = recording.scheduled
     if scheduled is None:
         return []
@@ -76,7 +77,7 @@ def planned_marks(actor: str, recording: Recording) -> list[Prop]:
 
 
 def contact_marks(actor: str, recording: Recording) -> list[Prop]:
-    """A disc below each foot that presses on the ground."""
+    """A disc below each foot while it presses on the ground."""
     support = recording.support
     return [
         _disc(
@@ -104,7 +105,8 @@ def balance_marks(actor: str, recording: Recording) -> list[Prop]:
 
 
 def push_arrows(actor: str, recording: Recording, lane: float = 0.0) -> list[Prop]:
-    """An arrow for every body that was pushed, its tip where the force acts, while it acts."""
+    """An arrow for every pushed body, visible during the push, with its tip near the body's centre
+    of mass, where the force acts. `lane` shifts the arrows along y, in metres."""
     model = recording.task.spec().compile()
     size = reach(model, recording.qpos[0])[0]
     pushed = np.flatnonzero(recording.forces[..., :3].any(axis=(0, 2)))
@@ -141,7 +143,7 @@ def push_arrows(actor: str, recording: Recording, lane: float = 0.0) -> list[Pro
 
 
 def flames(actor: str, recording: Recording) -> list[Prop]:
-    """The engines' flames, as long as their throttles say."""
+    """The flames of the engines; the length of each follows its throttle."""
     jets = recording.task.drawing().flames
     return [_flame(actor, f"{actor} flame {i}", jet, recording) for i, jet in enumerate(jets)]
 

@@ -1,4 +1,4 @@
-"""Pushes as people write them: 100N@0.5s:+y."""
+"""Reads pushes as users write them: 100N@0.5s:+y."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from tsbench.core.errors import TsbenchError
 from tsbench.core.task import Plant
 from tsbench.sim.push import Push, direction
 
-DURATION = 0.1  # s, of every push that is written so; the protocol's
+DURATION = 0.1  # s, of every push, as in the protocol
 _NUMBER = r"\d+(?:\.\d+)?"
 _GRAMMAR = re.compile(rf"({_NUMBER})N@({_NUMBER})s:([+-][xyz]|[+-]?{_NUMBER})")
 
 
 def parse_push(text: str, plant: Plant[Any]) -> Push:
-    """A push of 0.1 s: its force in newtons, when it begins in seconds, and where to: along an
-    axis of the plane that the plant is pushed in, or at a heading in degrees, as scores have it.
+    """A push of 0.1 s, from its force in newtons, its start in seconds, and its direction.
+
+    The direction is an axis of the plant's `push_plane`, or a heading in degrees as in scores: from
+    the first axis of that plane to the second.
 
     Raises:
-        TsbenchError: the text is no push, or one out of that plane.
+        TsbenchError: the text is no push, or its axis is outside that plane.
     """
     found = _GRAMMAR.fullmatch(text.replace(" ", ""))
     if not found:

@@ -1,4 +1,4 @@
-"""What happened in an episode, or would along a plan: poses, forces, contacts, rewards."""
+"""Recordings of an episode or of a plan: poses, forces, contacts and rewards over time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Recording:
     """T steps of one robot.
 
     Attributes:
-        task: whose physics and rewards these are.
+        task: the task that defines physics and rewards.
         qpos: generalised positions, shape (T + 1, nq).
         qvel: generalised velocities, shape (T + 1, nv).
         controls: of the actuators in each step, shape (T, nu).
@@ -68,7 +68,7 @@ class Recording:
 
     @cached_property
     def reward_terms(self) -> dict[str, Array]:
-        """The parts of each step's reward, and under "reward" the whole, each of shape (T,)."""
+        """The terms of each step's reward, and under "reward" the reward, each of shape (T,)."""
         before, after = self.states.rows(slice(0, -1)), self.states.rows(slice(1, None))
         terms = self.task.reward_terms(before, self.actions, after)
         return {**terms, "reward": self.task.reward(before, self.actions, after)}
@@ -82,26 +82,26 @@ class Recording:
 
     @cached_property
     def scheduled(self) -> NDArray[np.bool_] | None:
-        """Whether each foot is to be on the ground, shape (T + 1, feet); None if nothing says."""
+        """Whether each foot is scheduled to stand, shape (T + 1, feet); None without a schedule."""
         contacts = self.task.drawing().contacts
         return None if contacts is None else np.asarray(contacts(self.times), bool)
 
     @cached_property
     def support(self) -> Support:
-        """How it stands on the ground."""
+        """The robot's contacts with the ground."""
         return _support(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """How a robot stands on the ground; world frame, metres.
+    """A robot's contacts with the ground; world frame, metres.
 
     Attributes:
         feet: centres of `Drawing.feet`, shape (T + 1, feet, 3).
         contacts: whether each foot presses on the ground, shape (T + 1, feet).
         com: whole-body centre of mass, shape (T + 1, 3).
-        pressure: centre of pressure: the mean of all contact points with the ground, weighted
-            with their normal forces; not a number while there is none, shape (T + 1, 3).
+        pressure: centre of pressure, the mean of all contact points with the ground weighted by
+            their normal forces; NaN without contact, shape (T + 1, 3).
     """
 
     feet: Array
@@ -114,9 +114,9 @@ def record_episode(task: Task[Any], policy: PolicyFunction, push: Push | None = 
     """Plays one episode from the task's own start.
 
     Args:
-        task: what to play.
-        policy: what plays it.
-        push: a force on the robot while it plays.
+        task: the task.
+        policy: the policy, a function of observations (n, o).
+        push: a push on the robot during the episode, or None.
 
     Raises:
         TsbenchError: the policy is for another task, version or physics.
@@ -150,7 +150,7 @@ def record_episode(task: Task[Any], policy: PolicyFunction, push: Push | None = 
 
 
 def record_motion(task: Task[Any], motion: ReferenceMotion) -> Recording:
-    """A motion as if the physics followed it exactly: no forces, no actions.
+    """Records a motion as if the physics followed it exactly, without forces and actions.
 
     Raises:
         TsbenchError: the motion does not fit the task.
@@ -191,7 +191,7 @@ def _support(recording: Recording) -> Support:
     schedule and the reward pair it; for the first state, the step that begins there."""
     model = recording.task.spec().compile()
     feet = [model.geom(name).id for name in recording.task.drawing().feet]
-    fixed = model.body_weldid[model.geom_bodyid] == 0  # of geoms: the ground
+    fixed = model.body_weldid[model.geom_bodyid] == 0  # geoms that cannot move: the ground
     data = mujoco.MjData(model)
     count = len(recording.qpos)
     centres, contacts = np.zeros((count, len(feet), 3)), np.zeros((count, len(feet)), bool)

@@ -1,12 +1,12 @@
-"""From a compiled MuJoCo model to meshcat objects.
+"""Converts a compiled MuJoCo model to meshcat objects.
 
-`parts` turns every visible geom and site into a three.js geometry with its colour and its place
-on the body that carries it; `draw` sends them to a meshcat `Visualizer`, live or recorded;
-`body_poses` says where the bodies are. All lengths are in metres, in MuJoCo's frames: meshcat
-also has z up, only its shapes are built around y.
+`parts` turns every visible geom and site into a three.js geometry with its colour and its pose on
+the body that carries it. `draw` sends the parts to a meshcat `Visualizer`. `body_poses` computes
+the poses of the bodies. All lengths are in metres, in MuJoCo's frames. In meshcat z is up too, but
+its shapes are built around y.
 
-Covered: every geom type (a signed distance field as its mesh), 2-D textures on planes, mean
-colours of textures elsewhere. Not covered: tendons, skins and flexes.
+The module draws every geom type (a signed distance field as its mesh), 2-D textures on planes, and
+the mean colours of textures elsewhere. It does not draw tendons, skins and flexes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tsbench.core.errors import TsbenchError
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float, float]  # red, green, blue, opacity in [0, 1]
 
-VISIBLE_GROUPS = 3  # geoms and sites of groups 0, 1, 2: what MuJoCo's own viewers show at first
+VISIBLE_GROUPS = 3  # groups 0, 1, 2 of geoms and sites, as in MuJoCo's viewers by default
 UNSET_RGBA = (0.5, 0.5, 0.5, 1.0)  # MJCF's default, which gives way to a material's colour
 CAPSULE_ARC = 9  # points on each half circle of a capsule's outline
 LATHE_SEGMENTS = 24  # around the axis of a capsule
@@ -48,16 +48,16 @@ class Part:
 
     Attributes:
         name: unique in the model.
-        body: the body that carries it: its own or, where that one is welded to others, the
-            lowest that can move; 0, the world, when none can.
+        body: the body that carries the part: its own body, or the root of the bodies that this
+            body is welded to; 0, the world, if that body cannot move.
         geometry: meshcat's description of the shape.
         transform: from the shape to the carrying body's frame, scale included, shape (4, 4).
-        rgba: its colour in the model.
-        texture: drawn on it, or None.
-        closed: whether the shape has an inside that nobody sees.
-        faceted: whether its faces are flat, so that light must not be smoothed over their edges.
+        rgba: the part's colour in the model.
+        texture: the texture drawn on the part, or None.
+        closed: whether the shape's surface is closed, so that its inside is not drawn.
+        faceted: whether its faces are flat, so that light is not smoothed over their edges.
         shine: specular reflection and shininess, MuJoCo's numbers in [0, 1].
-        glows: whether its colour is its own light, as a picture's is, which no lamp changes.
+        glows: whether the part emits its colour, so that no light changes it.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Part:
 
 
 class Described(shapes.Geometry):
-    """A geometry of three.js that meshcat has no class for, by its JSON description."""
+    """A geometry of three.js without a class in meshcat, given by its JSON description."""
 
     def __init__(self, kind: str, **description: Any) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class Described(shapes.Geometry):
 
 
 def packed(array: ArrayLike, code: int = FLOAT32) -> umsgpack.Ext:
-    """Numbers as the typed array that meshcat's page unpacks, row after row."""
+    """An array as the typed array that meshcat's page unpacks, in row-major order."""
     return umsgpack.Ext(code, np.asarray(array, "<f4" if code == FLOAT32 else "<u4").tobytes())
 
 
@@ -94,7 +94,7 @@ def surface(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = N
     Args:
         vertices: shape (V, 3).
         faces: indices of vertices, counter-clockwise seen from outside, shape (F, 3).
-        normals: one per vertex, shape (V, 3); left to three.js when None.
+        normals: normals of the vertices, shape (V, 3); None lets three.js compute them.
     """
     attributes = {"position": vertices} | ({} if normals is None else {"normal": normals})
     return Described(
@@ -109,7 +109,8 @@ def surface(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = N
     )
 
 
-# Shapes: a geometry and the 3 x 3 map from it to the geom's frame, from the geom's size or asset
+# Each function below makes a shape from a geom's size or asset: a geometry, and the 3 x 3 map from
+# the geometry to the geom's frame.
 
 Shape = tuple[shapes.Geometry, Array]
 
@@ -143,7 +144,7 @@ def _box(size: Array) -> Shape:
 
 
 def _arrow(size: Array) -> Shape:
-    """From the origin along z: of no model, but MuJoCo's way to draw forces."""
+    """An arrow from the origin along z. Models have none; MuJoCo draws forces with it."""
     radius, length = size[:2]
     head = min(3.0 * radius, 0.5 * length)
     outline = [(0.0, 0.0), (radius, 0.0), (radius, length - head), (2 * radius, length - head)]
@@ -209,14 +210,15 @@ def _texture(model: mujoco.MjModel, material: int) -> int:
 def _tiles(model: mujoco.MjModel, material: int, size: Array) -> tuple[shapes.ImageTexture, Array]:
     """The texture of a plane, and the plane's half sizes.
 
-    MuJoCo repeats a texture `texrepeat` times over a plane or, where it is uniform or the plane
-    infinite, over every two metres from the centre on (seen in its renderer, 3.17).
+    MuJoCo's renderer (3.17) repeats a texture `texrepeat` times over a plane. If the texture is
+    uniform or the plane infinite, it repeats `texrepeat` times over every two metres from the
+    centre.
 
     Args:
         model: compiled model.
-        material: of the plane.
-        size: half sizes in metres, negative where the plane is infinite; those become so large
-            that whole textures lie on both sides of the centre.
+        material: the plane's material.
+        size: half sizes in metres, negative where the plane is infinite. An infinite plane grows
+            until whole textures lie on both sides of its centre.
     """
     repeat = np.array(model.mat_texrepeat[material], np.float64)
     infinite = size < 0.0
@@ -231,7 +233,7 @@ def _tiles(model: mujoco.MjModel, material: int, size: Array) -> tuple[shapes.Im
 
 
 def _colour(model: mujoco.MjModel, rgba: Array, material: int) -> Colour:
-    """MuJoCo's rule: an element's own rgba where it was set, else its material's."""
+    """The colour of an element by MuJoCo's rule: its own rgba if set, else its material's."""
     if material >= 0 and np.array_equal(rgba, np.array(UNSET_RGBA, np.float32)):
         rgba = model.mat_rgba[material]
     red, green, blue, opacity = (float(value) for value in rgba)
@@ -239,7 +241,7 @@ def _colour(model: mujoco.MjModel, rgba: Array, material: int) -> Colour:
 
 
 def _shaded(model: mujoco.MjModel, colour: Colour, texture: int) -> Colour:
-    """A colour under the mean of a texture that is not drawn itself."""
+    """A colour times the mean colour of a texture that is not drawn."""
     mean = _pixels(model, texture)[..., :3].mean(axis=(0, 1)) / 255.0
     red, green, blue = (float(value) for value in np.asarray(colour[:3]) * mean)
     return red, green, blue, colour[3]
@@ -257,14 +259,14 @@ def frame(position: ArrayLike, rotation: ArrayLike) -> Array:
 
 
 def parts(model: mujoco.MjModel, reach: float = 20.0) -> tuple[Part, ...]:
-    """Everything visible in a model: geoms and sites of groups 0 to 2 that are not clear.
+    """The visible parts of a model: geoms and sites of groups 0 to 2 that are not transparent.
 
     Args:
         model: compiled model.
         reach: half side in metres of planes that are infinite in MuJoCo.
     """
     data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)  # at qpos0; what is welded together stays so
+    mujoco.mj_kinematics(model, data)  # qpos0 suffices: welded bodies keep their relative poses
     found = []
     for kind, count, types in (
         ("geom", model.ngeom, model.geom_type),
@@ -296,7 +298,7 @@ def parts(model: mujoco.MjModel, reach: float = 20.0) -> tuple[Part, ...]:
             shine = (0.5, 0.5)  # MJCF's defaults
             if material >= 0:
                 shine = model.mat_specular[material], model.mat_shininess[material]
-            name = element.name.replace("/", ":") or str(index)  # "/" parts meshcat's paths
+            name = element.name.replace("/", ":") or str(index)  # "/" separates meshcat's paths
             found.append(
                 Part(
                     f"{kind} {name}",
@@ -331,10 +333,10 @@ def draw(
     """Sends parts to meshcat, each below the node of the body that carries it.
 
     Args:
-        vis: the node below which to draw.
-        model: the model that the parts are from.
-        elements: what to draw.
-        tint: one colour for everything in place of the model's own.
+        vis: the node below which the parts are drawn.
+        model: the model of the parts.
+        elements: the parts.
+        tint: one colour for all parts in place of their own, or None.
     """
     for part in elements:
         *colour, opacity = tint or part.rgba
@@ -350,7 +352,7 @@ def draw(
             map=None if tint else part.texture,
             opacity=opacity,
             side=FRONT_SIDE if part.closed else DOUBLE_SIDE,
-            # What is tinted gives way where it coincides with what is not.
+            # An untinted part covers a tinted one where both coincide.
             polygonOffset=tint is not None,
             polygonOffsetFactor=1,
             polygonOffsetUnits=1,
@@ -364,13 +366,13 @@ def draw(
 def draw_shape(
     vis: Visualizer, geom: mujoco.mjtGeom, size: Sequence[float], colour: Colour
 ) -> None:
-    """Sends one shape of a colour that no light changes, such as a mark.
+    """Sends one shape in a colour that no light changes, such as a mark.
 
     Args:
-        vis: its node.
-        geom: one of those that have sizes, or an arrow of a radius and a length along z.
-        size: in metres, as in MJCF.
-        colour: with opacity.
+        vis: the node of the shape.
+        geom: a geom type that has sizes, or an arrow with a radius and a length along z.
+        size: metres, as in MJCF.
+        colour: the colour, with opacity.
     """
     geometry, shape = FROM_SIZE[geom](np.asarray(size, np.float64))
     *rgb, opacity = colour
@@ -388,7 +390,7 @@ def placed(position: Array, quaternion: Array) -> Array:
 
 
 def moving_bodies(model: mujoco.MjModel) -> list[int]:
-    """Bodies that a pose can move and that carry others: all but the world and welded ones."""
+    """The bodies that a pose can move: all but the world and those welded to another body."""
     return [body for body in range(1, model.nbody) if model.body_weldid[body] == body]
 
 
@@ -398,13 +400,13 @@ def body_poses(model: mujoco.MjModel, qpos: ArrayLike, name: str = "given") -> t
     Args:
         model: compiled model.
         qpos: generalised positions, shape (T, nq).
-        name: of the motion, for errors.
+        name: name of the motion for errors.
 
     Returns:
         Positions, shape (T, nbody, 3), and unit quaternions (w, x, y, z), shape (T, nbody, 4).
 
     Raises:
-        TsbenchError: the poses are not of this model.
+        TsbenchError: the poses have another shape or are not finite.
     """
     qpos = np.asarray(qpos, float)
     if qpos.ndim != 2 or len(qpos) == 0 or qpos.shape[1] != model.nq:

@@ -1,7 +1,7 @@
-"""The live view: a small server on this machine that plays an episode and hands out its page.
+"""The live view: a small local server that plays an episode and serves its page.
 
-The page is the same as the one in a file, with one thing more: asked for `/?push=100N@0.5s:+y` the
-server plays the episode again with that push.
+The page is the same as in a file, and has a form for a push besides. For a request of
+`/?push=100N@0.5s:+y` the server plays the episode again with that push.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 
 from tsbench.core.errors import TsbenchError
 
-HOST = "127.0.0.1"  # nobody else's machine
-KEPT = 8  # pages, so that reloading one is quick
+HOST = "127.0.0.1"  # other machines cannot connect
+KEPT = 8  # pages kept in memory, so that reloading one is quick
 
-Render = Callable[[str | None], str]  # a push as people write it, or None -> the page
+Render = Callable[[str | None], str]  # makes the page for a push in words, or for None
 
 
 def server(render: Render, port: int) -> ThreadingHTTPServer:
     """A server of pages, to be run with `serve_forever`.
 
     Args:
-        render: makes a page; what it raises as TsbenchError the reader is told.
-        port: to listen on, 0 for any that is free.
+        render: makes a page; the server answers its TsbenchErrors as text.
+        port: the port to listen on, 0 for any free one.
 
     Raises:
         TsbenchError: the port is taken.
@@ -53,7 +53,7 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
             self.wfile.write(content)
 
         def log_message(self, *_: object) -> None:
-            """Nothing: the terminal belongs to the user."""
+            """Logs nothing, to keep the user's terminal free."""
 
     try:
         return ThreadingHTTPServer((HOST, port), Handler)
@@ -63,6 +63,6 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
 
 
 def address(running: ThreadingHTTPServer, push: str | None) -> str:
-    """Where the page is to be seen."""
+    """The address of the page."""
     query = f"?{urlencode({'push': push})}" if push else ""
     return f"http://{HOST}:{running.server_address[1]}/{query}"

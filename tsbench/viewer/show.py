@@ -1,6 +1,6 @@
-"""What is to be seen of a motion, whoever draws it: a page in a browser or a video.
+"""The content of a show, independent of the renderer that draws it, a page or a video.
 
-World frame, metres, seconds. `compose` makes shows from recordings.
+Positions are in the world frame in metres, times in seconds. `compose` makes shows from recordings.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tsbench.viewer.scene import Array, Colour
 
 Rgb = tuple[float, float, float]
 
-# From Okabe and Ito's palette, which colour-blind readers can tell apart.
+# Colours of Okabe and Ito's palette, which colour-blind readers can tell apart.
 EXECUTED_COLOUR: Rgb = (0.84, 0.37, 0.0)
 PLAN_COLOUR: Rgb = (0.0, 0.45, 0.70)
 OTHER_COLOUR: Rgb = (0.0, 0.62, 0.45)  # of the second of two policies
@@ -29,11 +29,11 @@ FLAME_COLOUR: Colour = (1.0, 0.62, 0.1, 0.9)
 INK: Rgb = (0.11, 0.15, 0.2)
 PENCIL: Rgb = (0.68, 0.74, 0.8)
 PAPER: Rgb = (1.0, 1.0, 1.0)
-SKY = (208, 220, 231)  # red, green, blue of 255; distant ground fades into it
+SKY = (208, 220, 231)  # red, green, blue of 255; distant ground fades to this colour
 GHOST_OPACITY = 0.4
 
 
-KEYFRAMES_PER_SECOND = 60.0  # more cannot be seen
+KEYFRAMES_PER_SECOND = 60.0  # screens rarely show more
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +41,14 @@ class Actor:
     """A robot that moves through the scene.
 
     Attributes:
-        name: its label and its node in meshcat's tree.
+        name: the actor's label, and its node in meshcat's tree.
         qpos: generalised positions, shape (T, nq).
-        timestep: seconds between them.
-        colour: of its label and its path, red, green, blue in [0, 1].
-        note: what the legend says of it.
-        ghost: translucent in its colour rather than solid in the model's colours; its path is
-            there from the beginning rather than drawn as it goes.
-        lane: metres by which it is moved aside, so that two do not run into each other.
+        timestep: seconds between two positions.
+        colour: colour of the label and the path; red, green, blue in [0, 1].
+        note: the actor's text in the legend.
+        ghost: whether the robot is translucent in `colour`, with its whole path shown from the
+            beginning. Other robots have the model's colours, and their paths grow with time.
+        lane: metres by which the robot is moved along y, so that two robots do not overlap.
     """
 
     name: str
@@ -62,19 +62,19 @@ class Actor:
 
 @dataclass(frozen=True, eq=False)
 class Prop:
-    """A mark, an arrow or a flame that comes and goes.
+    """A mark, an arrow or a flame, visible for some of the time.
 
     Attributes:
-        actor: the name of the actor that it belongs to.
-        name: its node in meshcat's tree.
-        geom: its shape, one of those that have sizes, or an arrow: from its position along z.
-        size: as in MJCF in metres, of an arrow its radius and length.
-        colour: with opacity.
+        actor: name of the actor that the prop belongs to.
+        name: the prop's node in meshcat's tree.
+        geom: a geom type that has sizes, or an arrow from the position along z.
+        size: metres, as in MJCF; radius and length of an arrow.
+        colour: the colour, with opacity.
         times: seconds, shape (K,).
         position: metres, shape (K, 3).
         quaternion: (w, x, y, z), shape (K, 4).
-        scale: of its sizes along its axes from each time to the next, 0 where it is not to be
-            seen, shape (K, 3).
+        scale: factors on the size along the prop's axes from each time to the next, 0 while the
+            prop is invisible, shape (K, 3).
     """
 
     actor: str
@@ -90,7 +90,7 @@ class Prop:
 
 @dataclass(frozen=True)
 class Landmark:
-    """A goal or an obstacle: a geom or site of that name, in world metres."""
+    """A goal or an obstacle, a geom or site of that name; world frame, metres."""
 
     text: str
     position: tuple[float, float, float]
@@ -100,7 +100,7 @@ class Landmark:
 
 @dataclass(frozen=True)
 class Entry:
-    """A line of the legend: `name`: `note`, beside a swatch of the colour."""
+    """A line of the legend: a swatch of the colour, the name and the note."""
 
     name: str
     colour: Rgb
@@ -109,11 +109,11 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """A row of the timeline that shows when something held: planned above executed.
+    """A row of the timeline with intervals of time, planned above executed.
 
     Attributes:
-        text: what it shows.
-        planned, executed: [begin, end] in seconds, in pairs.
+        text: the row's label.
+        planned, executed: the intervals, [begin, end] in seconds.
     """
 
     text: str
@@ -123,11 +123,11 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A row of the timeline with numbers over time.
+    """A row of the timeline with values over time.
 
     Attributes:
-        text: what it shows, with its unit.
-        lines: colour, seconds (K,), values (K,), the most important one last.
+        text: the row's label, with its unit.
+        lines: colour, seconds (K,) and values (K,) of each line, the most important line last.
     """
 
     text: str
@@ -139,14 +139,15 @@ class Show:
     """Everything that a page or a video shows.
 
     Attributes:
-        model: of the robot, with all that stands still.
-        actors: who moves; the camera follows the first.
-        title: what was run.
-        verdict: what became of it, in a sentence.
+        model: the model of the robot and of all static parts.
+        actors: the moving robots; the camera follows the first.
+        title: names the run, plan or task.
+        verdict: the outcome in a sentence.
         summary: labels and values of the score.
-        props: what explains the actors.
-        legend: of the props; actors and landmarks explain themselves.
+        props: marks, arrows and flames of the actors.
+        legend: the legend's lines for the props; those for actors and landmarks are added.
         timeline: the rows below the picture.
+        landmarks: goal and obstacles of the model.
     """
 
     model: mujoco.MjModel
@@ -165,12 +166,12 @@ class Show:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """An actor's motion, thinned to what can be seen.
+    """An actor's motion at the keyframes that are drawn; world frame.
 
     Attributes:
         times: seconds, shape (K,).
-        positions: of all bodies in the world in metres, shape (K, nbody, 3).
-        quaternions: (w, x, y, z), shape (K, nbody, 4).
+        positions: positions of all bodies in metres, shape (K, nbody, 3).
+        quaternions: orientations of all bodies (w, x, y, z), shape (K, nbody, 4).
     """
 
     times: Array
@@ -179,10 +180,10 @@ class Track:
 
 
 def track(model: mujoco.MjModel, actor: Actor) -> Track:
-    """Where the bodies of an actor are, at most 60 times a second and always at the end.
+    """The track of an actor, with at most 60 keyframes a second and always one at the end.
 
     Raises:
-        TsbenchError: the motion is not one of this model.
+        TsbenchError: the motion does not fit the model, or its time step is not positive.
     """
     if not (math.isfinite(actor.timestep) and actor.timestep > 0.0):
         raise TsbenchError(f"the time step of the {actor.name} motion is {actor.timestep}")
@@ -196,7 +197,7 @@ def track(model: mujoco.MjModel, actor: Actor) -> Track:
 
 
 def landmarks(model: mujoco.MjModel) -> list[Landmark]:
-    """What tasks add to a model under the names `goal` and `obstacle_1`, `obstacle_2`, ..."""
+    """The geoms and sites of a model with the names `goal`, `obstacle_1`, `obstacle_2`, ..."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     found = []

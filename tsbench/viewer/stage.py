@@ -1,4 +1,4 @@
-"""What stands still in a show: the task's model, its world's edge, the map of its reward."""
+"""The static parts of a show: the task's model, the border of its world, its reward map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,15 @@ MAP_PIXELS = 240  # along the longer side of a reward map
 
 
 def stage(recording: Recording, lane: float = 0.0) -> mujoco.MjModel:
-    """The task's model with its world's edge and reward map, and the goal once more in a lane."""
+    """The task's model with the world's border, the reward map, and a copy of the goal in a lane.
+
+    Args:
+        recording: a recording of the task.
+        lane: metres along y from the goal to its copy; 0 for no copy.
+
+    Raises:
+        TsbenchError: the world has bounds and is not flat across y.
+    """
     spec = recording.task.spec()
     goal = spec.site("goal")
     if lane and goal is not None:
@@ -31,14 +39,15 @@ def stage(recording: Recording, lane: float = 0.0) -> mujoco.MjModel:
 
 
 def furnish(spec: mujoco.MjSpec, drawing: Drawing, behind: float) -> None:
-    """Adds the world's edge and the map of its reward to a model, as things to look at only.
-
-    A planner's roadmap would go here too: one more call of `_line` for each of its edges.
+    """Adds the world's border and the reward map to a model, without contacts.
 
     Args:
-        spec: of the task.
-        drawing: of the task.
+        spec: the task's model.
+        drawing: the task's drawing.
         behind: metres by which the map lies behind the motion.
+
+    Raises:
+        TsbenchError: the world has bounds and is not flat across y.
     """
     if drawing.bounds is None:
         return
@@ -72,7 +81,8 @@ def _line(
 
 
 def _reward_map(spec: mujoco.MjSpec, drawing: Drawing, behind: float) -> None:
-    """A picture behind the world: gold where being pays, red where it costs, else like the sky."""
+    """Adds a picture behind the world: gold where the reward is positive, red where it is negative,
+    and else the colour of the sky."""
     assert drawing.bounds is not None
     assert drawing.worth is not None
     low, high = drawing.bounds

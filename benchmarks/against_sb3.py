@@ -1,14 +1,15 @@
-"""Stable-Baselines3's PPO, which the paper used, against ours: time to the same score.
+"""Stable-Baselines3's PPO, which the paper used, against tsbench's PPO: time to the same score.
 
-Ours trains in two stages with budget=fast, to its end. Stable-Baselines3 then learns to imitate
-the same reference motion, until its deterministic policy scores as much from the task's own start;
-that it stops there, and that its plan is a gift, are in its favour. Its settings are ours wherever
-it has them: networks, environments, steps between updates, held actions, epochs, minibatches,
-discounts, clipping, entropy, first spread, a falling learning rate; observations are encoded as
-ours and normalised by its VecNormalize. It has no bound for the spread, and where ours adapts the
-learning rate to a KL divergence, it keeps its default of 3e-4. Its environments are those of
-`tsbench.sim.gym` in one process, its default: on two cores a loop was faster than processes (the
-`loop` and `async` figures). Torch has one thread in both. Judging policies is not timed.
+tsbench trains in two stages with budget=fast, to the end. Stable-Baselines3 then imitates the same
+reference motion, until its deterministic policy reaches tsbench's score from the task's own start.
+Two points favour Stable-Baselines3: it stops as soon as it reaches the score, and its plan costs no
+time. Both use the same networks, environments, rollout length, held actions, epochs, minibatches,
+discounts, clipping, entropy, initial standard deviation and falling learning rate. Observations are
+encoded alike; VecNormalize normalises those of Stable-Baselines3. Stable-Baselines3 has no bound
+for the standard deviation. Where tsbench adapts the learning rate to a KL divergence,
+Stable-Baselines3 keeps its default of 3e-4. Its environments are those of `tsbench.sim.gym` in one
+process, its default, which is faster on two cores than one process each (the `loop` and `async`
+figures). Torch has one thread in both. The time to score policies is not counted.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ from tsbench.sim.single import environment
 from tsbench.sim.tracking import Imitation
 
 LEARNING_RATE = 3e-4  # Stable-Baselines3's own
-PATIENCE = 6.0  # times our time, after which it has failed
+PATIENCE = 6.0  # times tsbench's time, after which Stable-Baselines3 is stopped
 MODULES = {"elu": "ELU", "relu": "ReLU", "tanh": "Tanh"}  # activations in torch.nn
-CHECKS = 40  # of its policy while it uses our number of steps
+CHECKS = 40  # scores of its policy within tsbench's number of steps
 
 
 @comparison("sb3", requires=("stable_baselines3",), named=True)
@@ -65,13 +66,13 @@ def laikago(effort: Effort) -> Findings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of a training.
+    """The outcome of a training.
 
     Attributes:
         score: normalized reward of the deterministic policy from the task's own start.
-        solved: whether it counts as success.
-        seconds: wall-clock of learning to imitate.
-        steps: environment steps of that.
+        solved: whether that episode counts as a success.
+        seconds: wall-clock time of the imitation stage.
+        steps: environment steps of the imitation stage.
     """
 
     score: float
@@ -118,7 +119,8 @@ Judge = Callable[[PolicyFunction], tuple[float, bool]]
 
 
 def judge(task: Task[Any]) -> Judge:
-    """Scores policies by one episode from the task's own start."""
+    """A function that scores a policy by one episode from the task's own start: its normalized
+    reward, and whether it solved the task."""
 
     def score(policy: PolicyFunction) -> tuple[float, bool]:
         episode = play(task, Physics(task, 1), policy, 1, seed=0)
@@ -129,7 +131,7 @@ def judge(task: Task[Any]) -> Judge:
 
 
 def train(problem: Problem, folder: Path) -> Outcome:
-    """Our two stages; the reference motion is left in the folder."""
+    """Trains tsbench's two stages, and leaves the reference motion in the folder."""
     workspace = RunWorkspace(folder, Console(quiet=True))
     policy = methods.find("twostage").train(problem, workspace)
     workspace.close()
@@ -138,8 +140,10 @@ def train(problem: Problem, folder: Path) -> Outcome:
 
 
 class Held(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """Holds every action for some steps, or until the episode ends. As in `rl.vec_env`, the reward
-    is the sum of theirs over their number."""
+    """Holds every action for `repeat` steps, or until the episode ends.
+
+    As in `rl.vec_env`, the reward is the sum of the steps' rewards divided by `repeat`.
+    """
 
     def __init__(self, environment: gymnasium.Env[np.ndarray, np.ndarray], repeat: int) -> None:
         super().__init__(environment)
@@ -159,14 +163,20 @@ class Rival:
     """Stable-Baselines3's PPO in an imitation variant.
 
     Attributes:
-        model: it.
+        model: Stable-Baselines3's learner.
     """
 
     def __init__(
         self, imitation: Imitation[Any], chosen: PPOSettings, seed: int, steps: int
     ) -> None:
-        """`steps` are those over which a learning rate falls."""
-        # The package is an extra: it is looked for when it is needed.
+        """
+        Args:
+            imitation: the imitation variant to learn.
+            chosen: tsbench's settings.
+            seed: seed of the training.
+            steps: environment steps over which the learning rate falls.
+        """
+        # The package is optional, so it is imported when it is needed.
         vectors: Any = importlib.import_module("stable_baselines3.common.vec_env")
         torch_nn: Any = importlib.import_module("torch.nn")
         self._encode = ENCODINGS[chosen.encoding]
@@ -207,18 +217,18 @@ class Rival:
             device="cpu",
         )
         self.model.lr_schedule = rate
-        # Without a logger of its own it leaves an empty folder in the system's temporary one.
+        # Its default logger would leave an empty folder in the system's temporary folder.
         logging: Any = importlib.import_module("stable_baselines3.common.logger")
         self.model.set_logger(logging.Logger(folder=None, output_formats=[]))
 
     @property
     def steps(self) -> int:
-        """Environment steps so far; Stable-Baselines3 counts actions. Of the last hold of an
-        episode, which its end may cut short, all."""
+        """Environment steps so far. Stable-Baselines3 counts actions, and each counts as `repeat`
+        steps here, even where the episode ended within it."""
         return int(self.model.num_timesteps) * self._repeat
 
     def learn(self, ours: Outcome, score: Judge) -> Outcome:
-        """Until it scores as ours does, or has taken `PATIENCE` times as long."""
+        """Trains until it reaches tsbench's score or has taken `PATIENCE` times as long."""
         seconds = 0.0
         while True:
             began = time.perf_counter()

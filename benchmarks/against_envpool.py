@@ -1,6 +1,6 @@
-"""EnvPool's Ant-v5, the field's fast CPU environment, against bare physics of its model.
+"""EnvPool's Ant-v5, a fast CPU environment, against bare physics of the same model.
 
-EnvPool links a MuJoCo of its own (3.6 in 1.2.5), the bare physics here is ours; the note tells.
+EnvPool 1.2.5 links its own MuJoCo 3.6. The bare physics uses tsbench's MuJoCo.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tsbench.bench.stepping import RECORDED, bare, full_states
 from tsbench.bench.turns import Case, Effort, take_turns
 
 ANT = "envs/mujoco/assets/ant.xml"  # in gymnasium; EnvPool's copy differs by a notice only
-FRAME_SKIP = 5  # of Ant-v5
+FRAME_SKIP = 5  # as in Ant-v5
 SETTLE = 20  # control steps until the ants, which start in the air, are on the ground
 
 
@@ -34,7 +34,7 @@ def compare(effort: Effort) -> Findings:
 
 
 def envpool(count: int) -> Case:
-    """All environments at once on all cores, EnvPool's synchronous mode."""
+    """EnvPool's synchronous mode: all environments at once, on all cores."""
     module: Any = importlib.import_module("envpool")  # an extra
     pool = module.make_gymnasium("Ant-v5", num_envs=count, num_threads=os.cpu_count() or 1, seed=0)
     rng = np.random.default_rng(0)
@@ -48,7 +48,7 @@ def envpool(count: int) -> Case:
 
 
 def rollout(count: int) -> Case:
-    """Bare physics from states that ants with random actions go through."""
+    """Bare physics from states that random actions lead to."""
     model = mujoco.MjModel.from_xml_path(str(files("gymnasium") / ANT))
     batch = Batch(model, count)
     rng = np.random.default_rng(0)

@@ -1,0 +1,161 @@
+"""The package under examples/, as a user builds, installs, uses and removes it.
+
+docs/extending.md shows its files and these commands.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "examples" / "planar-puck"
+GUIDE = (ROOT / "docs" / "extending.md").read_text("utf-8")
+BLOCK = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+RUN = "runs/puck_gap/by_hand/seed0-smoke"
+
+
+def pieces(name: str) -> list[str]:
+    """What the guide shows of a file of the example, in order."""
+    return [text for _, file, text in BLOCK.findall(GUIDE) if file == name]
+
+
+def commands(title: str) -> list[str]:
+    """The commands of tsbench in the first block of a section of the guide."""
+    (section,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", GUIDE, re.MULTILINE | re.DOTALL)
+    block = next(text for language, _, text in BLOCK.findall(section) if language == "sh")
+    return [line for line in block.splitlines() if line.startswith("tsbench ")]
+
+
+def files() -> Iterator[str]:
+    for path in sorted(EXAMPLE.rglob("*")):
+        parts = path.relative_to(EXAMPLE).parts
+        made = any(part.startswith((".", "__pycache__", "dist", "build")) for part in parts)
+        if path.is_file() and not made:
+            yield "/".join(parts)
+
+
+def written(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line]
+
+
+@pytest.mark.parametrize("name", list(files()))
+def test_the_guide_shows_the_file(name: str) -> None:
+    """Whole, in pieces of whole lines; only blank lines may be missing between two of them."""
+    source = (EXAMPLE / name).read_text("utf-8")
+    shown = pieces(name)
+    assert shown, f"docs/extending.md does not show {name}"
+    for piece in shown:
+        assert f"\n{piece}" in f"\n{source}"
+    assert written("".join(shown)) == written(source)
+
+
+def test_the_guide_shows_no_other_file() -> None:
+    assert {file for _, file, _ in BLOCK.findall(GUIDE) if file} == set(files())
+
+
+@dataclass(frozen=True)
+class Installation:
+    """A virtual environment, and a directory to work in."""
+
+    venv: Path
+    folder: Path
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Runs a command of the environment's in the directory, without the checkout in sight."""
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+        environment["PATH"] = os.pathsep.join([str(self.venv / "bin"), os.environ["PATH"]])
+        return subprocess.run(
+            words, cwd=self.folder, env=environment, capture_output=True, text=True
+        )
+
+    def succeed(self, *words: str) -> str:
+        done = self.run(*words)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def pip(self, verb: str, *words: str) -> None:
+        """No index is asked: every requirement has to be there."""
+        options = ["--no-index"] if verb == "install" else []
+        interpreter = ["--python", str(self.venv / "bin" / "python")]
+        quiet = ["--disable-pip-version-check", "--quiet"]
+        self.succeed(sys.executable, "-m", "pip", *interpreter, verb, *quiet, *options, *words)
+
+    def listed(self) -> dict[str, Any]:
+        """What `tsbench list` tells."""
+        self.succeed("tsbench", "list", "--json", "list.json")
+        file = self.folder / "list.json"
+        content: dict[str, Any] = json.loads(file.read_text())
+        file.unlink()
+        return content
+
+
+@pytest.fixture
+def installation(tmp_path: Path) -> Installation:
+    """A fresh environment, which sees the dependencies that are installed for these tests."""
+    made = Installation(tmp_path / "venv", tmp_path / "work")
+    made.folder.mkdir()
+    venv.create(made.venv)
+    site = sysconfig.get_path("purelib", vars={"base": str(made.venv)})
+    dependencies = dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib"))
+    (Path(site) / "dependencies.pth").write_text("\n".join(dependencies))
+    return made
+
+
+def built(source: Path, folder: Path) -> str:
+    """The wheel of a source directory, which stays as it is."""
+    words = ["-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(source)]
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = folder.glob("*.whl")
+    return str(wheel)
+
+
+def test_the_example_is_installed_used_and_removed(
+    installation: Installation, tmp_path: Path
+) -> None:
+    for name, source in (("own", ROOT), ("example", EXAMPLE)):
+        installation.pip("install", built(source, tmp_path / name))
+
+    content = installation.listed()
+    assert content["plug-ins"] == {"planar-puck 0.1.0": ["puck_gap", "by_hand"]}
+    assert content["refused"] == []
+    where = installation.succeed("python", "-c", "import tsbench; print(tsbench.__file__)")
+    assert where.startswith(str(installation.venv))
+
+    answers = {}
+    for command in commands("Try it"):
+        answers[command] = installation.succeed(*command.split())
+    assert all(name in answers["tsbench list"] for name in ("puck_gap", "by_hand", "planar-puck"))
+    assert "compared bit for bit: equal" in answers[f"tsbench evaluate {RUN}"]
+    for method in ("by_hand", "twostage"):
+        run = installation.folder / "runs" / "puck_gap" / method / "seed0-smoke"
+        score = json.loads((run / "score.json").read_text())
+        assert (score["task"], score["method"]) == ("puck_gap", method)
+        assert (run / "report.html").is_file()
+    assert (installation.folder / "puck.html").stat().st_size > 100_000
+
+    shutil.copytree(EXAMPLE / "tests", installation.folder / "tests")
+    told = installation.succeed("python", "-m", "pytest", "-q", "tests")
+    assert re.search(r"^\d+ passed in ", told, re.MULTILINE), told
+
+    installation.pip("uninstall", "--yes", "planar-puck")
+    content = installation.listed()
+    assert content["plug-ins"] == {}
+    assert "puck_gap" not in content["tasks"]
+    assert "by_hand" not in content["methods"]
+    done = installation.run("tsbench", "evaluate", RUN)
+    assert done.returncode == 2
+    assert re.fullmatch(r"tsbench: unknown task 'puck_gap'; allowed: .*\n", done.stderr)
