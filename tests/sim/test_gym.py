@@ -86,9 +86,11 @@ def test_an_arrival_spares_steps() -> None:
         assert bool(info) == (terminated or truncated)
         if not info:
             continue
-        assert info == {"spared": planning.horizon - length if terminated else 0}
-        assert infos["final_info"]["spared"][0] == info["spared"]
-        assert infos["final_info"]["_spared"][0]
+        assert info["spared"] == (planning.horizon - length if terminated else 0)
+        assert info["quality"] == (1.0 if terminated else 0.0)  # nobody who stands gains ground
+        for name in ("spared", "quality"):
+            assert infos["final_info"][name][0] == info[name]
+            assert infos["final_info"][f"_{name}"][0]
         arrivals.append(info["spared"])
         coated.reset()
         length = 0

@@ -1,10 +1,12 @@
 """Tasks and their variants as Gymnasium environments, one at a time or many at once.
 
 Both classes wrap the environments that tsbench itself uses, and return the same floats.
-Some tasks end an episode when the robot arrives at the goal. The score counts the remaining steps,
-which the arrival spares, as perfect steps. When an episode ends, `info["spared"]` gives their
-number. A learner that ignores it treats an arrival like a fall, and earns more by hovering just
-outside the goal. Random starts are drawn from `np_random`.
+Some tasks end an episode when the robot arrives at the goal. The score credits the remaining steps,
+which the arrival spares. When an episode ends, `info["spared"]` gives their number, and
+`info["quality"]` what each is worth beside a perfect step. A learner that ignores them treats an
+arrival like a fall, and earns more by hovering just outside the goal; one that adds
+`MDP.credit(spared, quality, discount)` to the last reward learns by the score's own rule.
+Random starts are drawn from `np_random`.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """A dm_control environment of tsbench as a `gymnasium.Env`.
 
     `truncated` means that the episode ended at its last step, `terminated` that it ended for
-    another reason. At the end `info["spared"]` counts the steps that an arrival at the goal spares.
-    After `reset(seed=seed)` the episodes are those of `tsbench.load(..., seed=seed)`.
+    another reason. At the end `info["spared"]` counts the steps that an arrival at the goal spares,
+    and `info["quality"]` says what each is worth. After `reset(seed=seed)` the episodes are those of `tsbench.load(..., seed=seed)`.
 
     Attributes:
         single: the wrapped dm_control environment.
@@ -77,7 +79,9 @@ class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         terminated = time_step.last() and time_step.discount == 0.0
         truncated = time_step.last() and not terminated
         observation = time_step.observation[FLAT_OBSERVATION_KEY]
-        info = {"spared": self.single.task.spared()} if time_step.last() else {}
+        info: dict[str, Any] = {}
+        if time_step.last():
+            info = {"spared": self.single.task.spared(), "quality": self.single.task.quality()}
         return observation, time_step.reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
@@ -137,8 +141,9 @@ class GymVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 final[row] = observation
             ended = transition.terminal | transition.truncated
             infos = {"final_obs": final, "_final_obs": ended}
-            spared = {"spared": transition.spared, "_spared": ended.copy()}
-            infos |= {"final_info": spared, "_final_info": ended.copy()}
+            arrivals = {"spared": transition.spared, "quality": transition.quality}
+            final_info = {**arrivals, **{f"_{name}": ended.copy() for name in arrivals}}
+            infos |= {"final_info": final_info, "_final_info": ended.copy()}
         return (
             transition.observation,
             transition.reward,

@@ -86,6 +86,10 @@ class Adapter(control.Task):
         ended = bool(self.mdp.terminal(self.state)[0])
         return int(self.mdp.spared(self.state, self.course)[0]) if ended else 0
 
+    def quality(self) -> float:
+        """What each spared step is worth beside a perfect one (`MDP.quality`), in [0, 1]."""
+        return float(self.mdp.quality(self.course)[0])
+
     def action_spec(self, physics: dm_mujoco.Physics) -> dm_env.specs.BoundedArray:
         return dm_env.specs.BoundedArray(
             (self.mdp.action_size,), np.float64, minimum=-1.0, maximum=1.0, name="action"
