@@ -42,7 +42,8 @@ class GymEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     `truncated` means that the episode ended at its last step, `terminated` that it ended for
     another reason. At the end `info["spared"]` counts the steps that an arrival at the goal spares,
-    and `info["quality"]` says what each is worth. After `reset(seed=seed)` the episodes are those of `tsbench.load(..., seed=seed)`.
+    and `info["quality"]` says what each is worth. After `reset(seed=seed)` the episodes are those
+    of `tsbench.load(..., seed=seed)`.
 
     Attributes:
         single: the wrapped dm_control environment.
