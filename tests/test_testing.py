@@ -59,13 +59,6 @@ def crowded(self: Rocket, state: Any) -> Any:
     return seen + 1e-12 * len(seen)
 
 
-def shared(self: Rocket, state: Any) -> Any:
-    return SHARED.setdefault(self.name, Rocket.observation(self, state))
-
-
-SHARED: dict[str, Any] = {}
-
-
 def generous(self: Rocket, previous: Any, action: Any, state: Any) -> Any:
     return 1.0 + 0.0 * state.time
 
@@ -98,7 +91,6 @@ def unsettled(self: Rocket, rng: Any, count: int, *, perturbed: bool = False) ->
         ({"observation": wide}, "test_specs"),
         ({"observation": constant}, "test_no_observation_is_constant"),
         ({"observation": moody}, "test_the_same_seed_gives_the_same_episodes"),
-        ({"observation": shared}, "test_observations_are_not_shared"),
         ({"reward": generous}, "test_episodes"),
         ({"reward": stingy}, "test_episodes"),
         ({"control": free}, "test_actions_are_clipped"),
