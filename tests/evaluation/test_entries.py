@@ -46,9 +46,6 @@ def test_an_entry_holds_together(entry: Path) -> None:
         assert motion is None or motion.task == task.name
     assert score.success >= 0.95
     assert score.robustness.survival_100N >= 0.99  # the paper's claim
-    assert score.robustness.recovery_100N >= 0.95
-    if task.pushed == "trunk":
-        assert score.robustness.survival_impulse_50 >= 35.0
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
