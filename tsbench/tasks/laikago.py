@@ -668,9 +668,9 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         move = self.gait.base_speed * PLAN_TIMESTEP * push
         swing = self.gait.leg_length * self.gait.foot_speed * PLAN_TIMESTEP
         ahead = self._ahead(state)
-        # A foot's displacement is the world's, so that an idle foot stands still. A foot in stance
-        # is held: far from the goal the reward feels nothing, and plans that may slip there do.
-        # The base goes no further than the legs reach: a robot that does not step does not travel.
+        # The action gives a foot's displacement in the world frame: zero leaves the foot in place.
+        # A foot in stance is held, because far from the goal the reward does not punish slip. The
+        # base goes no further than the legs reach, so a robot that does not step does not travel.
         after = state.time + PLAN_TIMESTEP
         held = self.gait.contacts(state.time) & self.gait.contacts(after)
         step = xp.where(held, 0.0, 2.0 * swing * step)
