@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Set
 from importlib.metadata import requires, version
 from pathlib import Path
 from zipfile import ZIP_STORED, ZipFile
@@ -61,7 +62,7 @@ rm -r "$wheels"
 """
 
 
-def needed(have: set[str]) -> dict[str, str]:
+def needed(have: Set[str]) -> dict[str, str]:
     """The packages that tsbench with its extra `gpu` needs beyond `have`, with the versions that
     are installed here. What only `have` needs counts as there too."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
