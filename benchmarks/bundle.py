@@ -5,14 +5,13 @@
     PYTHONPATH=SITE:. python3 -m tsbench bench --only gpu
 
 The machine is expected to have torch, which is large, and what usually comes with it (`HAVE`). The
-wheels are for Linux on x86-64. Those larger than `PIECE` are packed more tightly and split, and
-`part1`, `part2`, ... hold at most `PART` each, so that they can be sent one by one.
+wheels are for Linux on x86-64. Those larger than `PIECE` are split, and `part1`, `part2`, ... hold
+at most `PART` each, so that they can be sent one by one.
 """
 
 from __future__ import annotations
 
 import argparse
-import lzma
 import shutil
 import subprocess
 import sys
@@ -20,7 +19,6 @@ import tomllib
 from collections.abc import Set
 from importlib.metadata import requires, version
 from pathlib import Path
-from zipfile import ZIP_STORED, ZipFile
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -49,11 +47,10 @@ set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 wheels=$(mktemp -d)
 find "$here" -name '*.whl' -exec cp {} "$wheels" \\;
-find "$here" -name '*.xz.00' | while read -r first; do
+find "$here" -name '*.whl.00' | while read -r first; do
     name=$(basename "${first%.00}")
     find "$here" -name "$name.[0-9][0-9]" -printf '%f %p\\n' | sort | cut -d' ' -f2- |
-        xargs -d '\\n' cat | python3 -c 'import lzma, shutil, sys
-shutil.copyfileobj(lzma.open(sys.stdin.buffer), sys.stdout.buffer)' >"$wheels/${name%.xz}"
+        xargs -d '\\n' cat >"$wheels/$name"
 done
 (cd "$wheels" && sha256sum --check --quiet "$here/SHA256SUMS")
 python3 -m pip install --quiet --no-index --no-deps --no-compile --upgrade --target "$1" \\
@@ -98,17 +95,6 @@ def fetch(name: str, release: str, folder: Path) -> None:
         subprocess.run([*pip, "wheel", *wanted, f"--wheel-dir={folder}"], check=True)
 
 
-def loosen(wheel: Path) -> None:
-    """Rewrites a wheel without compression, so that its files can be compressed all together."""
-    loose = wheel.with_suffix(".loose")
-    with ZipFile(wheel) as packed, ZipFile(loose, "w") as plain:
-        for entry in packed.infolist():
-            data = packed.read(entry)
-            entry.compress_type = ZIP_STORED
-            plain.writestr(entry, data)
-    loose.replace(wheel)
-
-
 def split(wheels: list[Path], folder: Path) -> int:
     """Distributes the wheels over parts, large ones in pieces; returns the number of parts."""
     pieces: list[tuple[str, bytes]] = []
@@ -117,9 +103,8 @@ def split(wheels: list[Path], folder: Path) -> int:
         if len(data) <= PIECE:
             pieces.append((wheel.name, data))
             continue
-        data = lzma.compress(data)
         starts = range(0, len(data), PIECE)
-        pieces += [(f"{wheel.name}.xz.{i:02}", data[s : s + PIECE]) for i, s in enumerate(starts)]
+        pieces += [(f"{wheel.name}.{i:02}", data[s : s + PIECE]) for i, s in enumerate(starts)]
     parts: list[int] = []  # bytes in each
     for name, data in sorted(pieces, key=lambda piece: -len(piece[1])):
         fitting = [i for i, size in enumerate(parts) if size + len(data) <= PART]
@@ -147,9 +132,6 @@ def main() -> None:
         sys.stdout.write(f"{name} {release}\n")
         fetch(name, release, whole)
     wheels = sorted(whole.glob("*.whl"))
-    for wheel in wheels:
-        if wheel.stat().st_size > PIECE:
-            loosen(wheel)
     sums = subprocess.run(
         ["sha256sum", *(w.name for w in wheels)], cwd=whole, capture_output=True, check=True
     )
