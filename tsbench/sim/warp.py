@@ -100,7 +100,9 @@ def _apply_pushes(
     i = wp.tid()
     end = time[i] + timestep
     number = wp.clamp(int(wp.floor((end - first[i]) / interval[i])), 0, force.shape[1] - 1)
-    begin = first[i] + float(number) * interval[i]
+    begin = first[i]
+    if number > 0:  # the interval of a single push is infinite
+        begin += float(number) * interval[i]
     covered = wp.min(begin + duration[i], end) - wp.max(begin, time[i])
     # Rounded, because full cover must give exactly one; float32 does not hold more digits.
     share = wp.clamp(wp.round(covered / timestep * 1.0e4) / 1.0e4, 0.0, 1.0)
@@ -490,6 +492,7 @@ class WarpPhysics(Generic[S]):
         self._steps = torch.zeros(
             1, dtype=torch.int64, device=self.device
         )  # of all worlds together
+        self._failures = torch.zeros(1, dtype=torch.int64, device=self.device)
         self._latency = torch.zeros(count, dtype=torch.int64, device=self.device)
         late = (count, disturbances.latency + 1, task.action_size)
         self._actions = torch.zeros(late, device=self.device)  # newest first
@@ -550,6 +553,7 @@ class WarpPhysics(Generic[S]):
 
     def read(self, state: S, memory: torch.Tensor) -> S:
         """The states after a step from `state`."""
+        self._failures += self.diverged.sum()
         readings = self.worlds.readings(state.time + self.task.timestep, memory)
         following = self.plant.read(readings)
 
@@ -568,6 +572,11 @@ class WarpPhysics(Generic[S]):
             TsbenchError: a step since the beginning left out contacts or constraints.
         """
         self.worlds.check()
+
+    def warned(self) -> dict[str, int]:
+        """How many steps could not be computed so far. Waits for the device."""
+        failures = int(self._failures)
+        return {"diverged": failures} if failures else {}
 
     def snapshot(self) -> dict[str, Any]:
         """All data that is kept between two calls, as arrays on the host."""
@@ -590,6 +599,7 @@ class WarpPhysics(Generic[S]):
             "actions": self._actions,
             "episode": self._episode,
             "steps": self._steps,
+            "failures": self._failures,
         }
 
     def _disturb(self, rows: torch.Tensor) -> None:
@@ -625,7 +635,7 @@ class HostPhysics(Generic[S]):
         substeps: physics steps done so far, all episodes together.
         diverged: rows in which the last step could not be computed, sorted.
         seconds: wall-clock time spent in the engine so far.
-        side_by_side: episodes that are best played at once.
+        side_by_side: how many episodes are best played at once.
     """
 
     def __init__(
@@ -649,6 +659,7 @@ class HostPhysics(Generic[S]):
         self.diverged = np.zeros(0, int)
         self._nstep = self.plant.substeps * (change or Change()).refine
         self.device = _exact(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.side_by_side = Physics.side_by_side if self.device.type == "cpu" else 4096
         self.worlds = Worlds(
             _model(task, change),
             count,
