@@ -192,6 +192,7 @@ class Worlds:
     Attributes:
         model: the compiled model.
         qpos, qvel: generalised positions (n, nq) and velocities (n, nv).
+        act: activations of actuators that have any, shape (n, na).
         ctrl: of the actuators, shape (n, nu).
         time: seconds since the start of the episode at which the next control step begins, (n,).
         sensordata: values of the sensors, shape (n, nsensordata). Current, as in `Readings`.
@@ -261,7 +262,7 @@ class Worlds:
         self.time, self.force = wp.to_torch(self._time), wp.to_torch(self._force)
         self.first, self.interval = wp.to_torch(self._first), wp.to_torch(self._interval)
         self.duration, self.diverged = wp.to_torch(self._duration), wp.to_torch(self._diverged)
-        self.act = wp.to_torch(self._d.act)
+        self.act, self._overflow = wp.to_torch(self._d.act), wp.to_torch(self._d.overflow)
         self._sensors = sensor_slices(model)
         self._streams: dict[Any, Any] = {}  # torch's, as warp's
         self._graph = self._recorded()
@@ -298,7 +299,7 @@ class Worlds:
             TsbenchError: a step since the beginning had more contacts or constraints than there was
                 room for, and left some out.
         """
-        found = int(np.bitwise_or.reduce(self._d.overflow.numpy(), initial=0)) & int(_OVERFLOW)
+        found = int(np.bitwise_or.reduce(self._overflow.cpu().numpy())) & int(_OVERFLOW)
         if found:
             raise TsbenchError(
                 f"the physics ran out of room ({mjw.OverflowType(found)!r}) for "
@@ -331,7 +332,7 @@ class Worlds:
                     gc.enable()
         self.qpos[:] = torch.as_tensor(self.model.qpos0)
         self.qvel[:] = 0.0
-        self._d.overflow.zero_()
+        self._overflow[:] = 0
         return capture.graph
 
     def _launch(self) -> None:
@@ -376,7 +377,8 @@ def capacity(model: mujoco.MjModel) -> tuple[int, int]:
     limits = int(np.sum(model.jnt_limited) + np.sum(model.tendon_limited))
     frictions = int(np.sum(model.dof_frictionloss > 0) + np.sum(model.tendon_frictionloss > 0))
     rows = touching * int(sides) + limits + frictions + 6 * model.neq
-    return touching + measured, rows
+    # Not zero: recorded on a CPU, mujoco-warp's step without room for constraints moves nothing.
+    return max(touching + measured, 1), max(rows, 1)
 
 
 _DISTANCE_SENSORS = (
@@ -468,7 +470,6 @@ class WarpPhysics(Generic[S]):
         self._substeps = self.plant.substeps * (change or Change()).refine
         model = _model(task, change)
         rng = np.random.default_rng(seed)
-        variants = _variants(model, disturbances, rng, count)
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
         self.worlds = Worlds(
             model,
@@ -478,7 +479,7 @@ class WarpPhysics(Generic[S]):
             timestep=task.timestep,
             substeps=self._substeps,
             pushes=pushes if disturbances.push else 1,
-            variants=variants,
+            variants=variants(model, disturbances, rng, count),
             deterministic=deterministic,
             contacts=contacts,
             rows=rows,
@@ -717,7 +718,7 @@ class HostPhysics(Generic[S]):
         return _host(self.worlds.qpos), _host(self.worlds.qvel)
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(values, dtype=torch.float32, device=self.device)
+        return torch.tensor(np.array(values), dtype=torch.float32, device=self.device)
 
     def _read(self, rows: np.ndarray, time: np.ndarray, memory: np.ndarray) -> S:
         nowhere = self.worlds.time[:, None][:, :0]
@@ -758,7 +759,7 @@ def _model(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
     return model
 
 
-def _variants(
+def variants(
     model: mujoco.MjModel, disturbances: Disturbances, rng: Rng, count: int
 ) -> list[mujoco.MjModel]:
     """Models of disturbed mass, friction and strength; none where nothing disturbs them."""
