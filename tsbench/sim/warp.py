@@ -318,10 +318,16 @@ class Worlds:
         return wp.ScopedDevice(self._device)
 
     def _recorded(self) -> Any:
-        """The graph of a control step."""
+        """The graph of a control step.
+
+        Raises:
+            TsbenchError: what was recorded is not what was called.
+        """
+        self.qpos[:] = torch.as_tensor(self.model.qpos0)
         with wp.ScopedDevice(self._device):
             self._launch()  # compiles and loads the kernels, which a recording must not
             wp.synchronize_device(self._device)
+            wanted = torch.cat([self.qpos[0], self.qvel[0]]).clone()
             collects = gc.isenabled()
             gc.disable()  # freeing an array while a GPU records would spoil the recording
             try:
@@ -330,10 +336,21 @@ class Worlds:
             finally:
                 if collects:
                     gc.enable()
+        self._rest()
+        with self._stream():
+            wp.capture_launch(capture.graph)
+        found = torch.cat([self.qpos[0], self.qvel[0]])
+        if not torch.allclose(found, wanted, rtol=1e-3, atol=1e-3):
+            raise TsbenchError("warp recorded another step than it was given: the physics is wrong")
+        self._rest()
+        wp.synchronize_device(self._device)
+        return capture.graph
+
+    def _rest(self) -> None:
         self.qpos[:] = torch.as_tensor(self.model.qpos0)
         self.qvel[:] = 0.0
+        self.act[:] = 0.0
         self._overflow[:] = 0
-        return capture.graph
 
     def _launch(self) -> None:
         m, d = self._m, self._d
