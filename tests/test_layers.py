@@ -35,7 +35,7 @@ ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 
 # The rooms, or single files of rooms, that may import each package.
 ONLY_IN: dict[str, set[str]] = {
-    "torch": {"rl", "testing", "sim.warp"},
+    "torch": {"rl", "sim.device", "sim.warp", "testing"},
     "warp": {"sim.warp"},
     "mujoco_warp": {"sim.warp"},
     "rsl_rl": {"rl", "testing"},

@@ -178,7 +178,7 @@ class _Job:
     def __call__(self, node: DictConfig) -> float:
         """Completes a run and its pages. Returns its normalized reward, NaN if it failed."""
         words = list(HydraConfig.get().overrides.task)
-        chosen = placed(config.parse(node), words)
+        chosen = placed(config.parse(node, config.keys(words)), words)
         place = RunDirectory(Path(chosen.directory or ""))
         try:
             reward = execute.complete(chosen, words)

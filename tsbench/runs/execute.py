@@ -26,6 +26,7 @@ from tsbench.core.typed import unknown_key
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
+from tsbench.rl.devices import torch_device
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
 from tsbench.runs.config import RunConfig
@@ -48,7 +49,10 @@ def prepare(config: RunConfig) -> Problem:
         options=config.method,
         seed=config.seed,
         threads=config.threads,
+        device=config.device,
+        deterministic=config.deterministic,
     )
+    torch_device(problem.device)
     name = config.method["name"]
     methods.options(methods.find(name).Options, problem)
     known = methods.all_stages()

@@ -64,14 +64,15 @@ class PlacedDynamics(Dynamics[S], Protocol[S]):
 Engine = Callable[..., PlacedDynamics[Any]]
 
 
-def expect_shape(action: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Checks the shape of an action, since numpy would broadcast some wrong shapes.
+def expect_shape(action: Array, shape: tuple[int, ...]) -> None:
+    """Checks the shape of an action, since libraries would broadcast some wrong shapes.
 
     Raises:
         TsbenchError: the action has another shape.
     """
-    if np.shape(action) != shape:
-        raise TsbenchError(f"the action has shape {np.shape(action)}, not {shape}")
+    found = tuple(np.shape(action))
+    if found != shape:
+        raise TsbenchError(f"the action has shape {found}, not {shape}")
 
 
 def expect_finite(

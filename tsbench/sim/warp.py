@@ -32,6 +32,7 @@ from tsbench.core.errors import TsbenchError
 from tsbench.core.state import Readings, Rng, S, Start
 from tsbench.core.task import SimulatedTask
 from tsbench.sim.change import Change
+from tsbench.sim.device import Replayed, merged
 from tsbench.sim.disturbed import Disturbances
 from tsbench.sim.model import sensor_slices
 from tsbench.sim.physics import Physics
@@ -279,14 +280,17 @@ class Worlds:
 
     def readings(self, time: torch.Tensor, memory: torch.Tensor) -> Readings:
         """Copies of what a task reads, because the next step overwrites the arrays."""
-        sensordata = self.sensordata.clone()
         return Readings(
             time=time,
             qpos=self.qpos.clone(),
             qvel=self.qvel.clone(),
-            sensors={name: sensordata[:, part] for name, part in self._sensors.items()},
+            sensors=self.sensors(self.sensordata.clone()),
             memory=memory,
         )
+
+    def sensors(self, sensordata: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The values of each sensor by name, each (n, dim), in the values of all (n, sizes)."""
+        return {name: sensordata[:, part] for name, part in self._sensors.items()}
 
     def launch(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
         """One thread of a kernel for each world, in torch's order."""
@@ -525,6 +529,10 @@ class WarpPhysics(Generic[S]):
             wp.from_torch(self._latency),
         ]
         self._count = wp.from_torch(self._steps)
+        # What only computes, as graphs of its own on a GPU.
+        self._controlled = Replayed(self.plant.control, self.device)
+        self._followed = Replayed(self._follow, self.device)
+        self._chosen = Replayed(self._choose, self.device)
 
     @property
     def substeps(self) -> int:
@@ -542,46 +550,63 @@ class WarpPhysics(Generic[S]):
             The states that `which` names, of all n rows; they mean something where `rows` holds.
         """
         worlds = self.worlds
-        for array, starts in ((worlds.qpos, self._starts[0]), (worlds.qvel, self._starts[1])):
-            array.copy_(torch.where(rows[:, None], starts[which], array))
+        qpos, qvel, fresh = self._chosen(which, rows, worlds.qpos, worlds.qvel)
+        worlds.qpos.copy_(qpos)
+        worlds.qvel.copy_(qvel)
         worlds.act.masked_fill_(rows[:, None], 0.0)
         if self.disturbances.push or self.disturbances.latency:
             self._disturb(rows)
         if self.disturbances.latency:
             self._actions.masked_fill_(rows[:, None, None], 0.0)
-        return self._fresh.rows(which)
+        return fresh
+
+    def _choose(
+        self, which: torch.Tensor, rows: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, S]:
+        """Positions and velocities with those of the chosen starts in `rows`, and their states."""
+        places = [
+            torch.where(rows[:, None], starts[which], old)
+            for starts, old in zip(self._starts, (qpos, qvel), strict=True)
+        ]
+        return places[0], places[1], self._fresh.rows(which)
 
     def advance(self, state: S, action: torch.Tensor) -> S:
-        """The states one time step later. It is `act`, `Worlds.step` and `read`; whoever records
-        the first and the last in graphs of his own calls the three."""
-        memory = self.act(state, action)
-        self.worlds.step()
-        return self.read(state, memory)
-
-    def act(self, state: S, action: torch.Tensor) -> torch.Tensor:
-        """Sets the controls for an action; returns the memory for the next state."""
+        """The states one time step later."""
+        worlds = self.worlds
         if self.disturbances.latency:
             self._actions.copy_(torch.cat([action[:, None], self._actions[:, :-1]], dim=1))
             action = self._actions[torch.arange(len(action), device=self.device), self._latency]
-        control, memory = self.plant.control(state, action)
-        self.worlds.ctrl.copy_(control)
-        self.worlds.time.copy_(state.time)
+        control, memory = self._controlled(state, action)
+        worlds.ctrl.copy_(control)
+        worlds.time.copy_(state.time)
         self._steps += len(action)
-        return memory
-
-    def read(self, state: S, memory: torch.Tensor) -> S:
-        """The states after a step from `state`."""
+        worlds.step()
         self._failures += self.diverged.sum()
-        readings = self.worlds.readings(state.time + self.task.timestep, memory)
-        following = self.plant.read(readings)
-
-        def kept(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-            stays = self.diverged.reshape(-1, *(1,) * (after.ndim - 1))
-            return torch.where(stays, before, after)
-
-        return following.replace(
-            **{name: kept(getattr(state, name), value) for name, value in vars(following).items()}
+        return self._followed(
+            state, memory, worlds.qpos, worlds.qvel, worlds.sensordata, self.diverged
         )
+
+    def _follow(
+        self,
+        state: S,
+        memory: torch.Tensor,
+        qpos: torch.Tensor,
+        qvel: torch.Tensor,
+        sensordata: torch.Tensor,
+        diverged: torch.Tensor,
+    ) -> S:
+        """The states after a step from `state`; where the physics diverged, those before it."""
+        following = self.plant.read(
+            Readings(
+                time=state.time + self.task.timestep,
+                # Copies, because the next step overwrites the arrays.
+                qpos=qpos.clone(),
+                qvel=qvel.clone(),
+                sensors=self.worlds.sensors(sensordata.clone()),
+                memory=memory,
+            )
+        )
+        return merged(diverged, state, following)
 
     def check(self) -> None:
         """Waits for the device. To be called once in a while, such as once a rollout.
