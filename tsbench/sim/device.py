@@ -44,12 +44,14 @@ class DeviceDynamics(Protocol[S]):
         pool: number of starts to choose from.
         diverged: whether the last step of a row could not be computed, shape (n,). Such a row
             keeps the state before that step, and its episode has to end.
-        substeps: physics steps done so far, all episodes together.
     """
 
     pool: int
     diverged: Tensor
-    substeps: int
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps done so far, all episodes together; may wait for the device."""
 
     def begin(self, which: Tensor, rows: Tensor) -> S:
         """Starts new episodes.

@@ -202,6 +202,8 @@ class Worlds:
         duration: of the pushes in seconds, shape (n,).
         force: of the pushes in newtons, shape (n, pushes, 3).
         diverged: whether the last control step met a huge or not finite number, shape (n,).
+        nefc: rows of constraints that each world had last, shape (n,).
+        rows: of constraints that there is room for in each world.
     """
 
     def __init__(
@@ -264,6 +266,7 @@ class Worlds:
         self.first, self.interval = wp.to_torch(self._first), wp.to_torch(self._interval)
         self.duration, self.diverged = wp.to_torch(self._duration), wp.to_torch(self._diverged)
         self.act, self._overflow = wp.to_torch(self._d.act), wp.to_torch(self._d.overflow)
+        self.nefc, self.rows = wp.to_torch(self._d.nefc), self._d.njmax
         self._sensors = sensor_slices(model)
         self._streams: dict[Any, Any] = {}  # torch's, as warp's
         self._graph = self._recorded()
