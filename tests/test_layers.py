@@ -35,7 +35,7 @@ ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 
 # The rooms, or single files of rooms, that may import each package.
 ONLY_IN: dict[str, set[str]] = {
-    "torch": {"rl", "sim.device", "sim.warp", "testing"},
+    "torch": {"rl", "sim.device", "sim.warp", "bench.gpu", "testing"},
     "warp": {"sim.warp"},
     "mujoco_warp": {"sim.warp"},
     "rsl_rl": {"rl", "testing"},

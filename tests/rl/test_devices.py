@@ -56,8 +56,10 @@ def test_a_machine_without_a_gpu() -> None:
 def test_a_gpu_that_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
     assert devices.pick() == "cuda"
+    assert devices.torch_device("cuda") == torch.device("cuda:0")
+    assert devices.torch_device("cuda:1") == torch.device("cuda:1")
+    monkeypatch.setenv("LOCAL_RANK", "1")  # the second process that torchrun has started
     assert devices.torch_device("cuda") == torch.device("cuda:1")
     with pytest.raises(TsbenchError, match="no such GPU here; allowed: cuda:0, cuda:1"):
         devices.torch_device("cuda:2")
@@ -78,7 +80,7 @@ def test_the_update_off_the_cpu_is_rsl_rls() -> None:
     assert settings(problem, "plan").update == "rsl_rl"
     assert settings(replace(problem, device="cpu"), "plan").update == "auto"
     asked = replace(problem, training={"plan": {"update": "numpy"}})
-    with pytest.raises(TsbenchError, match="numpy works on the CPU only, not on warp"):
+    with pytest.raises(TsbenchError, match="numpy works in one process on the CPU, not on warp"):
         settings(asked, "plan")
 
 

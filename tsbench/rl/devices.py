@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from tsbench.core.errors import TsbenchError
+from tsbench.rl import processes
 
 CPU, WARP = "cpu", "warp"
 DRIVER = Path("/proc/driver/nvidia/version")  # of NVIDIA's kernel module on Linux
@@ -28,7 +29,7 @@ def pick() -> str:
 
 
 def torch_device(name: str) -> torch.device:
-    """The device of the tensors.
+    """The device of the tensors. Of several processes each has its own GPU by the name `cuda`.
 
     Raises:
         TsbenchError: this machine or this installation lacks it.
@@ -43,7 +44,7 @@ def torch_device(name: str) -> torch.device:
     if not count:
         raise TsbenchError(f"device={name}: torch finds no GPU here; allowed: {CPU}, {WARP}")
     device = torch.device(name)
-    index = torch.cuda.current_device() if device.index is None else device.index
+    index = processes.local_rank() if device.index is None else device.index
     if index >= count:
         names = ", ".join(f"cuda:{number}" for number in range(count))
         raise TsbenchError(f"device={name}: there is no such GPU here; allowed: {names}")

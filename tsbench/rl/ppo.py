@@ -20,6 +20,7 @@ from rsl_rl.storage import RolloutStorage
 from tsbench.core.errors import NotFiniteError, TsbenchError
 from tsbench.core.policy import Policy, PolicyInfo
 from tsbench.core.task import Task
+from tsbench.rl import processes
 from tsbench.rl.rollout import Rollout
 from tsbench.rl.settings import PPOSettings
 from tsbench.rl.threads import one_thread
@@ -37,7 +38,7 @@ class Learner:
     """An actor and a critic that learn in one environment.
 
     Attributes:
-        steps: environment steps taken.
+        steps: environment steps taken, of all processes together.
     """
 
     @one_thread()
@@ -80,6 +81,8 @@ class Learner:
             )
             with torch.no_grad():
                 self._actor.distribution.log_std_param.fill_(math.log(settings.initial_std))
+        if processes.count() > 1:  # the same weights, but other actions
+            torch.manual_seed(processes.own(seed))
 
     def _networks(self) -> tuple[MLPModel, MLPModel]:
         """Actor and critic with initial weights."""
@@ -144,7 +147,7 @@ class Learner:
             losses = self._update.update()
             self._expect_finite(losses)
             self._expect_sound()
-            self.steps += self.settings.steps
+            self.steps += self.settings.steps * processes.count()
             self._settle(min(self.steps / steps, 1.0))
             if report is not None:
                 environment, physics = env.seconds

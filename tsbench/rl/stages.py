@@ -14,6 +14,7 @@ from tsbench.core.errors import TsbenchError
 from tsbench.core.method import Monitor, Problem, Workspace
 from tsbench.core.task import SimulatedTask
 from tsbench.core.typed import typed_items
+from tsbench.rl import processes
 from tsbench.rl.devices import CPU, torch_device, working_on
 from tsbench.rl.ppo import Learner, Report
 from tsbench.rl.settings import PPOSettings
@@ -40,7 +41,7 @@ def settings(problem: Problem, kind: str) -> StageSettings:
 
     Kinds are the names that methods give in their `STAGES`. Two have rules of their own: `plan` has
     no physics that could be disturbed, and `finetune` begins with the settings of `imitate`. Off
-    the CPU `update: auto` is rsl-rl's own update.
+    the CPU and in several processes `update: auto` is rsl-rl's own update.
 
     Raises:
         TsbenchError: unknown names or values of the wrong type or range.
@@ -54,10 +55,11 @@ def settings(problem: Problem, kind: str) -> StageSettings:
     if disturb != Disturbances() and disturb.interval < problem.task.timestep:
         step = f"a control step of {problem.task.timestep:.3g} s"
         raise TsbenchError(f"task.training.{kind}.disturb.interval must be at least {step}")
-    if problem.device != CPU:
+    if problem.device != CPU or processes.count() > 1:
         if changes.get("update") == "numpy":
+            where = f"on {problem.device}" if problem.device != CPU else "in several processes"
             raise TsbenchError(
-                f"task.training.{kind}.update: numpy works on the CPU only, not on {problem.device}"
+                f"task.training.{kind}.update: numpy works in one process on the CPU, not {where}"
             )
         changes["update"] = "rsl_rl"
     try:
@@ -132,34 +134,35 @@ def learn_physics(
 
 def planning_environment(problem: Problem, planning: Planning[Any], count: int) -> Environment:
     """`count` episodes of the planning variant on the problem's device."""
+    seed = processes.own(problem.seed)
     if problem.device == CPU:
-        return BatchedEnvironment(planning, planning, count, problem.seed)
+        return BatchedEnvironment(planning, planning, count, seed)
     device = torch_device(problem.device)
-    dynamics = DeviceKinematics(planning, count, problem.seed, device)
-    return DeviceEnvironment(planning, dynamics, count, problem.seed, device)
+    dynamics = DeviceKinematics(planning, count, seed, device)
+    return DeviceEnvironment(planning, dynamics, count, seed, device)
 
 
 def physics_environment(
     problem: Problem, task: SimulatedTask[Any], chosen: StageSettings
 ) -> Environment:
     """Episodes of a task in full physics on the problem's device, disturbed as `chosen` says."""
-    count, disturb = chosen.environments, chosen.disturb
+    count, disturb, seed = chosen.environments, chosen.disturb, processes.own(problem.seed)
     if problem.device == CPU:
         physics: Physics[Any] = DisturbedPhysics(
-            task, count, disturb, problem.seed, threads=problem.threads
+            task, count, disturb, seed, threads=problem.threads
         )
-        return BatchedEnvironment(task, physics, count, problem.seed)
+        return BatchedEnvironment(task, physics, count, seed)
     device = torch_device(problem.device)
     dynamics: DeviceDynamics[Any] = import_module("tsbench.sim.warp").WarpPhysics(  # of an extra
         task,
         count,
         device=device,
         disturbances=disturb,
-        seed=problem.seed,
+        seed=seed,
         threads=problem.threads,
         deterministic=problem.deterministic,
     )
-    return DeviceEnvironment(task, dynamics, count, problem.seed, device)
+    return DeviceEnvironment(task, dynamics, count, seed, device)
 
 
 def _reporting(
