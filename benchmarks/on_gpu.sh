@@ -4,7 +4,7 @@
 #
 #   bash benchmarks/on_gpu.sh OUT [STEP ...]      with tsbench's packages on the path
 #
-# OUT gets log.txt, bench.json and runs.tgz. Steps: versions check trot rocket obstacles walk bench.
+# OUT gets log.txt, bench.json and runs.tgz. Steps: versions check physics trot rocket obstacles walk bench.
 set -u
 out=$1
 shift
@@ -35,6 +35,7 @@ for step in $steps; do
 print(torch.__version__, warp.__version__, mujoco.__version__, torch.cuda.get_device_name())'
         run versions 60 python3 -m tsbench list
         ;;
+    physics) run physics 330 python3 benchmarks/gpu_physics.py --seconds 270 ;;
     check) run check 240 python3 benchmarks/gpu_check.py ;;
     trot) train trot 300 task=laikago_trot ;;
     walk) train walk 300 task=laikago_walk ;;

@@ -275,7 +275,7 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="NAME",
         help="v1 or smoke, which takes seconds (as the run was scored, else v1)",
     )
-    help_physics = "elliptic or half_step: play it there too, and count the verdicts that flip"
+    help_physics = "elliptic, half_step or warp: play it there too, and count verdicts that flip"
     parser.add_argument("--physics", metavar="NAME", help=help_physics)
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
@@ -308,6 +308,7 @@ def _evaluate(words: Sequence[str]) -> int:
             parser.error("--keep keeps certified scores: leave out --physics")
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
+    engine = _engine(options.physics)
     console, standard = Console(), tasks.standard(task)
     with progress_bar(console, "evaluate") as progress:
         score = evaluate(
@@ -331,6 +332,7 @@ def _evaluate(words: Sequence[str]) -> int:
                 protocol=protocol.elsewhere(options.physics),
                 threads=options.threads,
                 progress=progress,
+                engine=engine,
             )
         flipped = flips(score, other)
         console.print(tables.flips_table(options.physics, flipped))
@@ -350,6 +352,21 @@ def _evaluate(words: Sequence[str]) -> int:
         directory.keep(run, options.keep, score)
         console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
     return 0
+
+
+def _engine(physics: str | None) -> Any:
+    """What plays a score in one of the other physics (`evaluation.protocol.PHYSICS`).
+
+    Raises:
+        TsbenchError: its packages are not installed.
+    """
+    if physics == "warp":
+        from tsbench.sim.warp import HostPhysics
+
+        return HostPhysics
+    from tsbench.sim.physics import Physics
+
+    return Physics
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:

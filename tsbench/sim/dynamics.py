@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
 
 from tsbench.core.arrays import Array
 from tsbench.core.errors import NotFiniteError, TsbenchError
-from tsbench.core.state import Rng, S, State
+from tsbench.core.state import Rng, S, Start, State
+from tsbench.sim.push import Push
 
 
 class Dynamics(Protocol[S]):
@@ -39,6 +40,28 @@ class LastingDynamics(Dynamics[S], Protocol[S]):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restores the state of a snapshot."""
+
+
+class PlacedDynamics(Dynamics[S], Protocol[S]):
+    """Full physics in which scores are played.
+
+    Attributes:
+        push: the push that disturbs the episodes, or None.
+        side_by_side: how many episodes are best played at once.
+    """
+
+    push: Push | None
+    side_by_side: int
+
+    def place(self, rows: np.ndarray, start: Start) -> S:
+        """Puts the simulations in `rows` where `start` says and returns their states."""
+
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """qpos (n, nq) and qvel (n, nv) of all simulations."""
+
+
+# Makes them: (task, count, *, threads, change).
+Engine = Callable[..., PlacedDynamics[Any]]
 
 
 def expect_shape(action: Array, shape: tuple[int, ...]) -> None:

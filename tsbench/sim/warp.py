@@ -101,7 +101,9 @@ def _apply_pushes(
     i = wp.tid()
     end = time[i] + timestep
     number = wp.clamp(int(wp.floor((end - first[i]) / interval[i])), 0, force.shape[1] - 1)
-    begin = first[i] + float(number) * interval[i]
+    begin = first[i]
+    if number > 0:  # the interval of a single push is infinite
+        begin += float(number) * interval[i]
     covered = wp.min(begin + duration[i], end) - wp.max(begin, time[i])
     # Rounded, because full cover must give exactly one; float32 does not hold more digits.
     share = wp.clamp(wp.round(covered / timestep * 1.0e4) / 1.0e4, 0.0, 1.0)
@@ -191,6 +193,7 @@ class Worlds:
     Attributes:
         model: the compiled model.
         qpos, qvel: generalised positions (n, nq) and velocities (n, nv).
+        act: activations of actuators that have any, shape (n, na).
         ctrl: of the actuators, shape (n, nu).
         time: seconds since the start of the episode at which the next control step begins, (n,).
         sensordata: values of the sensors, shape (n, nsensordata). Current, as in `Readings`.
@@ -199,6 +202,8 @@ class Worlds:
         duration: of the pushes in seconds, shape (n,).
         force: of the pushes in newtons, shape (n, pushes, 3).
         diverged: whether the last control step met a huge or not finite number, shape (n,).
+        nefc: rows of constraints that each world had last, shape (n,).
+        rows: of constraints that there is room for in each world.
     """
 
     def __init__(
@@ -260,7 +265,8 @@ class Worlds:
         self.time, self.force = wp.to_torch(self._time), wp.to_torch(self._force)
         self.first, self.interval = wp.to_torch(self._first), wp.to_torch(self._interval)
         self.duration, self.diverged = wp.to_torch(self._duration), wp.to_torch(self._diverged)
-        self.act = wp.to_torch(self._d.act)
+        self.act, self._overflow = wp.to_torch(self._d.act), wp.to_torch(self._d.overflow)
+        self.nefc, self.rows = wp.to_torch(self._d.nefc), self._d.njmax
         self._sensors = sensor_slices(model)
         self._streams: dict[Any, Any] = {}  # torch's, as warp's
         self._graph = self._recorded()
@@ -300,7 +306,7 @@ class Worlds:
             TsbenchError: a step since the beginning had more contacts or constraints than there was
                 room for, and left some out.
         """
-        found = int(np.bitwise_or.reduce(self._d.overflow.numpy(), initial=0)) & int(_OVERFLOW)
+        found = int(np.bitwise_or.reduce(self._overflow.cpu().numpy())) & int(_OVERFLOW)
         if found:
             raise TsbenchError(
                 f"the physics ran out of room ({mjw.OverflowType(found)!r}) for "
@@ -319,10 +325,16 @@ class Worlds:
         return wp.ScopedDevice(self._device)
 
     def _recorded(self) -> Any:
-        """The graph of a control step."""
+        """The graph of a control step.
+
+        Raises:
+            TsbenchError: what was recorded is not what was called.
+        """
+        self.qpos[:] = torch.as_tensor(self.model.qpos0)
         with wp.ScopedDevice(self._device):
             self._launch()  # compiles and loads the kernels, which a recording must not
             wp.synchronize_device(self._device)
+            wanted = torch.cat([self.qpos[0], self.qvel[0]]).clone()
             collects = gc.isenabled()
             gc.disable()  # freeing an array while a GPU records would spoil the recording
             try:
@@ -331,10 +343,21 @@ class Worlds:
             finally:
                 if collects:
                     gc.enable()
+        self._rest()
+        with self._stream():
+            wp.capture_launch(capture.graph)
+        found = torch.cat([self.qpos[0], self.qvel[0]])
+        if not torch.allclose(found, wanted, rtol=1e-3, atol=1e-3):
+            raise TsbenchError("warp recorded another step than it was given: the physics is wrong")
+        self._rest()
+        wp.synchronize_device(self._device)
+        return capture.graph
+
+    def _rest(self) -> None:
         self.qpos[:] = torch.as_tensor(self.model.qpos0)
         self.qvel[:] = 0.0
-        self._d.overflow.zero_()
-        return capture.graph
+        self.act[:] = 0.0
+        self._overflow[:] = 0
 
     def _launch(self) -> None:
         m, d = self._m, self._d
@@ -378,7 +401,8 @@ def capacity(model: mujoco.MjModel) -> tuple[int, int]:
     limits = int(np.sum(model.jnt_limited) + np.sum(model.tendon_limited))
     frictions = int(np.sum(model.dof_frictionloss > 0) + np.sum(model.tendon_frictionloss > 0))
     rows = touching * int(sides) + limits + frictions + 6 * model.neq
-    return touching + measured, rows
+    # Not zero: recorded on a CPU, mujoco-warp's step without room for constraints moves nothing.
+    return max(touching + measured, 1), max(rows, 1)
 
 
 _DISTANCE_SENSORS = (
@@ -470,7 +494,6 @@ class WarpPhysics(Generic[S]):
         self._substeps = self.plant.substeps * (change or Change()).refine
         model = _model(task, change)
         rng = np.random.default_rng(seed)
-        variants = _variants(model, disturbances, rng, count)
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
         self.worlds = Worlds(
             model,
@@ -480,7 +503,7 @@ class WarpPhysics(Generic[S]):
             timestep=task.timestep,
             substeps=self._substeps,
             pushes=pushes if disturbances.push else 1,
-            variants=variants,
+            variants=variants(model, disturbances, rng, count),
             deterministic=deterministic,
             contacts=contacts,
             rows=rows,
@@ -494,6 +517,7 @@ class WarpPhysics(Generic[S]):
         self._steps = torch.zeros(
             1, dtype=torch.int64, device=self.device
         )  # of all worlds together
+        self._failures = torch.zeros(1, dtype=torch.int64, device=self.device)
         self._latency = torch.zeros(count, dtype=torch.int64, device=self.device)
         late = (count, disturbances.latency + 1, task.action_size)
         self._actions = torch.zeros(late, device=self.device)  # newest first
@@ -558,8 +582,9 @@ class WarpPhysics(Generic[S]):
         control, memory = self._controlled(state, action)
         worlds.ctrl.copy_(control)
         worlds.time.copy_(state.time)
-        self._steps += 1
+        self._steps += len(action)
         worlds.step()
+        self._failures += self.diverged.sum()
         return self._followed(
             state, memory, worlds.qpos, worlds.qvel, worlds.sensordata, self.diverged
         )
@@ -595,8 +620,9 @@ class WarpPhysics(Generic[S]):
         self.worlds.check()
 
     def warned(self) -> dict[str, int]:
-        """mujoco-warp counts no warnings."""
-        return {}
+        """How many steps could not be computed so far. Waits for the device."""
+        failures = int(self._failures)
+        return {"diverged": failures} if failures else {}
 
     def snapshot(self) -> dict[str, Any]:
         """All data that is kept between two calls, as arrays on the host."""
@@ -619,6 +645,7 @@ class WarpPhysics(Generic[S]):
             "actions": self._actions,
             "episode": self._episode,
             "steps": self._steps,
+            "failures": self._failures,
         }
 
     def _disturb(self, rows: torch.Tensor) -> None:
@@ -654,7 +681,7 @@ class HostPhysics(Generic[S]):
         substeps: physics steps done so far, all episodes together.
         diverged: rows in which the last step could not be computed, sorted.
         seconds: wall-clock time spent in the engine so far.
-        side_by_side: episodes that are best played at once.
+        side_by_side: how many episodes are best played at once.
     """
 
     def __init__(
@@ -678,6 +705,7 @@ class HostPhysics(Generic[S]):
         self.diverged = np.zeros(0, int)
         self._nstep = self.plant.substeps * (change or Change()).refine
         self.device = _exact(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.side_by_side = Physics.side_by_side if self.device.type == "cpu" else 4096
         self.worlds = Worlds(
             _model(task, change),
             count,
@@ -735,7 +763,7 @@ class HostPhysics(Generic[S]):
         return _host(self.worlds.qpos), _host(self.worlds.qvel)
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(values, dtype=torch.float32, device=self.device)
+        return torch.tensor(np.array(values), dtype=torch.float32, device=self.device)
 
     def _read(self, rows: np.ndarray, time: np.ndarray, memory: np.ndarray) -> S:
         nowhere = self.worlds.time[:, None][:, :0]
@@ -776,7 +804,7 @@ def _model(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
     return model
 
 
-def _variants(
+def variants(
     model: mujoco.MjModel, disturbances: Disturbances, rng: Rng, count: int
 ) -> list[mujoco.MjModel]:
     """Models of disturbed mass, friction and strength; none where nothing disturbs them."""
