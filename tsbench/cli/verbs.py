@@ -33,6 +33,9 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
+  device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
+  deterministic=true
+                   the same bits each time on a GPU, for more time
   resume=RUN       goes on with an interrupted run, to the same bits; alone, without other words
   method.KEY=...   an option of the method
   task.training.STAGE.KEY=...
