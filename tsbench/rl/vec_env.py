@@ -295,7 +295,7 @@ class TensorEnvironment(LearnerEnvironment):
         # `clone` for the encoding that returns its argument.
         encoded = {"policy": self._encode(observation), "value": self._encode(value)}
         tensors = {name: group.clone() for name, group in encoded.items()}
-        return TensorDict(tensors, batch_size=[self.num_envs], device=self.device)
+        return TensorDict(tensors, batch_size=[self.num_envs])
 
 
 def _floats(values: np.ndarray) -> torch.Tensor:
