@@ -3,8 +3,8 @@
     python3 benchmarks/gpu_check.py
 
 * Planning on the GPU agrees with planning on the CPU, step for step, over whole episodes.
-* Recorded graphs give the same bits as the functions that they were recorded from, in planning and
-  in deterministic physics.
+* Recorded graphs give what the functions give that they were recorded from: in planning the same
+  bits, and nearly the same in some steps of the physics, which adds numbers in any order.
 * Neither a step nor the learner's inference waits for the GPU.
 
 Exits with status 1 if a check fails.
@@ -32,7 +32,9 @@ from tsbench.sim.warp import WarpPhysics
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
 ROWS, STEPS = 256, 200
-WITHIN = 1e-3  # of observations and rewards, in float32 over whole episodes
+PHYSICS_STEPS = 8  # few, because what a last bit changes grows
+WITHIN = 1e-3  # of observations and rewards, in float32
+PHYSICS_WITHIN = 5e-2  # the same; a wrong graph is off by far more
 
 
 def planning(task: Any, device: torch.device, explore: float = 0.0) -> DeviceEnvironment[Any]:
@@ -42,7 +44,7 @@ def planning(task: Any, device: torch.device, explore: float = 0.0) -> DeviceEnv
 
 
 def physics(task: Any) -> DeviceEnvironment[Any]:
-    dynamics: WarpPhysics[Any] = WarpPhysics(task, ROWS, device=GPU, deterministic=True)
+    dynamics: WarpPhysics[Any] = WarpPhysics(task, ROWS, device=GPU, pool=ROWS)
     return DeviceEnvironment(task, dynamics, ROWS, 0, GPU)
 
 
@@ -85,13 +87,17 @@ def agrees_with_the_cpu(task: Any) -> str:
     return f"off by {worst:.1e} at most; {int((~alike).sum())} of {ROWS} rows ended at other steps"
 
 
-def graphs_equal_functions(make: Callable[[], DeviceEnvironment[Any]]) -> str:
-    replayed = played(make(), 60)
+def graphs_equal_functions(
+    make: Callable[[], DeviceEnvironment[Any]], steps: int, within: float
+) -> str:
+    replayed = played(make(), steps)
     with eager():
-        called = played(make(), 60)
-    for one, other in zip(replayed, called, strict=True):
-        assert torch.equal(one, other), (one - other).abs().max() if one.is_floating_point() else ""
-    return f"equal bits; {int((called[2] | called[3]).sum())} endings"
+        called = played(make(), steps)
+    worst = max(float((replayed[i] - called[i]).abs().max()) for i in (0, 1))
+    assert worst <= within, worst
+    assert torch.equal(replayed[2], called[2])
+    assert torch.equal(replayed[3], called[3])
+    return f"off by {worst:.1e} at most; {int((called[2] | called[3]).sum())} endings"
 
 
 def nothing_waits(make: Callable[[], DeviceEnvironment[Any]]) -> str:
@@ -119,18 +125,22 @@ def nothing_waits(make: Callable[[], DeviceEnvironment[Any]]) -> str:
 
 def main() -> int:
     failed = 0
+    seen: set[type] = set()  # the physics of one task of each kind is enough
     for name in tasks.names():
         task = tasks.make(name)
-        makers: dict[str, Callable[[], DeviceEnvironment[Any]]] = {
-            "physics": partial(physics, task)
-        }
         checks: dict[str, Callable[[], str]] = {}
         if isinstance(task, Plannable):
-            makers["planning"] = partial(planning, task, GPU, 0.5)
+            make = partial(planning, task, GPU, 0.5)
             checks["planning agrees with the CPU"] = partial(agrees_with_the_cpu, task)
-        for kind, make in makers.items():
-            checks[f"graphs of {kind}"] = partial(graphs_equal_functions, make)
-            checks[f"{kind} waits for nothing"] = partial(nothing_waits, make)
+            checks["graphs of planning"] = partial(graphs_equal_functions, make, STEPS, 0.0)
+            checks["planning waits for nothing"] = partial(nothing_waits, make)
+        if type(task) not in seen:
+            seen.add(type(task))
+            make = partial(physics, task)
+            checks["graphs of physics"] = partial(
+                graphs_equal_functions, make, PHYSICS_STEPS, PHYSICS_WITHIN
+            )
+            checks["physics waits for nothing"] = partial(nothing_waits, make)
         for what, check in checks.items():
             try:
                 said = f"ok, {check()}"

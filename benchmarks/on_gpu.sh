@@ -1,6 +1,6 @@
 #!/bin/bash
-# Everything that a machine with a GPU should show, in one go of about ten minutes; a step that
-# fails or takes too long does not stop the next.
+# Everything that a machine with a GPU should show. A step that fails or takes too long does not stop
+# the next.
 #
 #   bash benchmarks/on_gpu.sh OUT [STEP ...]      with tsbench's packages on the path
 #

@@ -26,6 +26,7 @@ from tsbench.sim.device import DeviceEnvironment, DeviceKinematics
 from tsbench.sim.disturbed import Disturbances
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.warp import WarpPhysics
+from tsbench.testing.operations import WAITING, Operations
 
 CPU = torch.device("cpu")
 ROWS, SEED = 16, 3
@@ -138,6 +139,24 @@ def test_an_interrupted_learner_goes_on_to_the_same_bits(
     for name, weight in whole._actor.state_dict().items():
         assert torch.equal(weight, rest._actor.state_dict()[name]), name
     assert whole._env.finished() == rest._env.finished()
+
+
+@pytest.mark.parametrize("make", [planning, physics])
+def test_collecting_steps_never_waits_for_the_device(
+    make: Callable[[], DeviceEnvironment[Any]],
+) -> None:
+    learner = Learner(make(), SETTINGS, SEED)
+    rollout, env = learner._rollout, learner._env
+    with torch.inference_mode():
+        observation, rewards, dones, extras = env.step(rollout.act(env.get_observations()))
+        rollout.add(rewards, dones, extras)
+        with Operations() as seen:
+            observation, rewards, dones, extras = env.step(rollout.act(observation))
+            env.count(rewards, dones, extras)
+            rewards += learner._credit(extras)
+            rollout.add(rewards, dones, extras)
+    assert "mul" in seen.names
+    assert not seen.names & WAITING
 
 
 def test_a_number_that_is_not_finite_ends_the_learning() -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from tsbench import tasks
 from tsbench.core.errors import NotFiniteError
@@ -16,12 +14,10 @@ from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.device import DeviceEnvironment, DeviceKinematics, at_device
 from tsbench.sim.kinematic import Planning
 from tsbench.testing.episodes import plannable_tasks
+from tsbench.testing.operations import WAITING, Operations
 
 CPU = torch.device("cpu")
 ROWS, STARTS, SEED = 24, 64, 5
-# What waits for the device or makes shapes depend on values, by which a CUDA graph cannot be
-# recorded.
-FORBIDDEN = {"_local_scalar_dense", "nonzero", "masked_select", "lift_fresh", "item", "_to_copy"}
 
 
 class SameStarts(Planning[Any]):
@@ -97,25 +93,23 @@ def test_agrees_with_the_batched_environment(name: str, explore: float) -> None:
 
 @pytest.mark.parametrize("name", plannable_tasks())
 def test_a_step_never_waits_for_the_device(name: str) -> None:
-    class Seen(TorchDispatchMode):
-        def __init__(self) -> None:
-            super().__init__()
-            self.operations: set[str] = set()
-
-        def __torch_dispatch__(
-            self, func: Any, types: Any, args: Any = (), kwargs: Mapping[str, Any] | None = None
-        ) -> Any:
-            self.operations.add(func.overloadpacket.__name__)
-            return func(*args, **(kwargs or {}))
-
     device = on_device(name, 0.5)
     device.reset()
     first, second = (torch.from_numpy(action) for action in actions(device, 2, 1.0))
     device.step(first)  # constants move to the device
-    with Seen() as seen:
+    with Operations() as seen:
         device.step(second)
-    assert "where" in seen.operations
-    assert not seen.operations & FORBIDDEN
+    assert "where" in seen.names
+    assert not seen.names & {*WAITING, "_to_copy"}
+
+
+def test_waiting_would_be_seen() -> None:
+    """By reading a value, by a shape that depends on values, and by a number from the host."""
+    values = torch.ones(3)
+    for wait in (lambda: bool(values.any()), values.nonzero, lambda: torch.tensor(1.0)):
+        with Operations() as seen:
+            wait()
+        assert seen.names & WAITING
 
 
 def test_a_share_of_the_episodes_begins_at_sampled_states() -> None:
