@@ -81,6 +81,7 @@ def test_words_change_values_and_open_mappings_need_no_plus() -> None:
         ([TASK, "checkpoint=nan"], "checkpoint must not be negative, not nan"),
         ([TASK, "budget=fats"], "unknown budget 'fats'; allowed: fast, paper, smoke"),
         ([TASK, "budget=1"], "budget must be text, not 1"),
+        ([TASK, "task.budgets.smoke.audit=skip"], "task.budgets.smoke.audit must be stop or warn"),
         ([TASK, "task.budgets.fast.plan=0"], "task.budgets.fast.plan must be at least 1, not 0"),
         ([TASK, "task.budgets.fast=3"], "task.budgets.fast must be key: value pairs, not 3"),
         ([TASK, "task.training.plan=3"], "task.training.plan must be key: value pairs, not 3"),

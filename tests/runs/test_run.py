@@ -574,6 +574,15 @@ def test_a_run_that_fails_later_keeps_what_it_has(
     assert not (tmp_path / "mine" / "score.json").exists()
 
 
+def test_a_plan_that_fails_its_audit_ends_the_run(tmp_path: Path) -> None:
+    """It is no fault that resuming could mend, so the message does not offer that."""
+    with pytest.raises(TsbenchError, match=r"fails its audit: .*; the plan is in .*mine") as caught:
+        execute(tmp_path / "mine", [*WORDS, "method.audit=stop"])
+    assert "resume" not in str(caught.value)
+    assert (tmp_path / "mine" / "plan.npz").exists()
+    assert not (tmp_path / "mine" / "policy.safetensors").exists()
+
+
 # A goal so near that an episode takes 1.5 s.
 SHORT = [
     *WORDS[:3],
