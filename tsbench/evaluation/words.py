@@ -11,7 +11,7 @@ from tsbench.evaluation.references import beside
 from tsbench.evaluation.score import Score, Summary
 
 FIGURES = {  # the meaning of each figure
-    "solved_reward": "reward as a share of the largest possible, 0 for an unsolved episode",
+    "solved_reward": "reward as a share of the largest possible, 0 if unsolved",
     "normalized_reward": "the same share, solved or not",
     "against_plan": "reward over the reward of the best plan; a policy may pass 1",
     "success": "share of solved episodes",
@@ -41,7 +41,7 @@ def push_rows(score: Score) -> Iterator[tuple[str, str, str]]:
     """Rows of a label, the value of survival, and the value of recovery."""
     robustness = score.robustness
     yield (
-        f"pushes of {claim_force(score):.3g} N (survival_100N, recovery_100N)",
+        f"of {claim_force(score):.3g} N (survival_100N, recovery_100N)",
         f"{robustness.survival_100N:.1%}",
         f"{robustness.recovery_100N:.1%}",
     )
