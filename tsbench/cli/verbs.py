@@ -353,7 +353,7 @@ def _evaluate(words: Sequence[str]) -> int:
     write_json(options.json, shown)
     if agrees is False:
         if options.keep is not None:
-            console.print(" not kept: this score differs from the recorded one", highlight=False)
+            console.print(" not kept: the score differs from the recorded one", highlight=False)
         return 1
     if options.keep is not None:
         directory.keep(run, options.keep, score)
