@@ -4,7 +4,9 @@
 #
 #   bash benchmarks/on_gpu.sh OUT [STEP ...]      with tsbench's packages on the path
 #
-# OUT gets log.txt, bench.json and runs.tgz. Steps: versions check physics trot rocket obstacles walk bench.
+# OUT gets log.txt, bench.json and runs.tgz. The steps, in the order of the default:
+#   versions check trot rocket bench obstacles walk
+# and physics, which is not among them.
 set -u
 out=$1
 shift

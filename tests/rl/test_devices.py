@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,9 @@ from tsbench.rl.vec_env import TensorEnvironment, TorchEnvironment
 from tsbench.runs.checkpoint import decode, encode
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.device import DeviceEnvironment, DeviceKinematics
+from tsbench.sim.disturbed import Disturbances
 from tsbench.sim.kinematic import Planning
+from tsbench.sim.warp import WarpPhysics
 
 CPU = torch.device("cpu")
 ROWS, SEED = 16, 3
@@ -110,13 +113,26 @@ def test_actions_are_held_as_in_numpy() -> None:
     assert device.finished() == figures
 
 
-def test_an_interrupted_learner_goes_on_to_the_same_bits() -> None:
-    whole = Learner(planning(), SETTINGS, SEED)
+def physics() -> DeviceEnvironment[Any]:
+    """On mujoco-warp, with pushes that grow with the steps taken and actions that come late."""
+    task = tasks.make("laikago_walk")
+    disturb = Disturbances(push=50.0, rise=400, interval=0.2, mass=0.2, latency=2)
+    dynamics: WarpPhysics[Any] = WarpPhysics(
+        task, ROWS, device=CPU, disturbances=disturb, seed=SEED, pool=32, deterministic=True
+    )
+    return DeviceEnvironment(task, dynamics, ROWS, SEED, CPU)
+
+
+@pytest.mark.parametrize("make", [planning, physics])
+def test_an_interrupted_learner_goes_on_to_the_same_bits(
+    make: Callable[[], DeviceEnvironment[Any]],
+) -> None:
+    whole = Learner(make(), SETTINGS, SEED)
     whole.learn(6 * SETTINGS.steps)
-    part = Learner(planning(), SETTINGS, SEED)
+    part = Learner(make(), SETTINGS, SEED)
     part.learn(2 * SETTINGS.steps)
     snapshot = decode(encode(part.snapshot()))
-    rest = Learner(planning(explore=0.0), SETTINGS, SEED + 1)
+    rest = Learner(make(), SETTINGS, SEED + 1)
     rest.restore(snapshot)
     rest.learn(6 * SETTINGS.steps)
     for name, weight in whole._actor.state_dict().items():

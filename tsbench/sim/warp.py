@@ -86,7 +86,7 @@ _CONTACTS = 8
 _MOST_CONTACTS = 128  # of a world; models in which more could touch at once hardly ever have more
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _apply_pushes(
     time: wp.array[float],
     first: wp.array[float],
@@ -110,7 +110,7 @@ def _apply_pushes(
     applied[i, body] = wp.spatial_vector(share * force[i, number], wp.vec3(0.0))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _disturb(
     begins: wp.array[wp.bool],
     seed: int,
@@ -148,7 +148,7 @@ def _disturb(
     latency[i] = wp.int64(wp.randi(rng, 0, latest + 1))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _look_for_divergence(
     rest: wp.array2d[float],
     qpos: wp.array2d[float],
