@@ -5,8 +5,9 @@
 trains `budget=fast` with seeds 0 to 9, each as it is and with initial weights that differ by one
 millionth, which stands for another processor (`tsbench.testing.rounding`). All of the words of
 `tsbench run` but seed are allowed. A training succeeds when its last policy solves at least 95 of
-the protocol's 100 perturbed starts. The file gets a line for each training as it ends; trainings
-that it has are not repeated, so that an interrupted study goes on. The table is made from the file.
+the protocol's 100 perturbed starts. A plan that fails its audit is a training that fails. The file
+gets a line for each training as it ends. Trainings that it has are not repeated, so that an
+interrupted study goes on. The table is made from the file.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tsbench import methods
-from tsbench.core.errors import TsbenchError
+from tsbench.core.errors import PlanError, TsbenchError
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import V1
 from tsbench.rl.threads import one_thread
@@ -46,19 +47,25 @@ ENOUGH = 0.95  # share of the perturbed starts that a training has to solve
 def train(words: list[str], seed: int, rounding: float) -> dict[str, Any]:
     """One training, and what its last policy is worth."""
     chosen = config.compose([*words, f"seed={seed}", "threads=1"])
+    row: dict[str, Any] = {"words": words, "seed": seed, "rounding": rounding}
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, perturbed(rounding), one_thread():
         problem = prepare(chosen)
         workspace = RunWorkspace(Path(folder), Console(quiet=True))
-        policy = methods.find(chosen.method["name"]).train(problem, workspace)
-        workspace.close()
+        try:
+            policy = methods.find(chosen.method["name"]).train(problem, workspace)
+        except PlanError as refused:
+            sys.stderr.write(f"seed {seed}, rounding {rounding:g}: {refused}\n")
+            nothing = ("solved", "solved_reward", "normalized_reward", "survival_100N")
+            return {**row, **dict.fromkeys(nothing, 0.0), "seconds": time.perf_counter() - began}
+        finally:
+            workspace.close()
         seconds = time.perf_counter() - began
         score = evaluate(policy, problem.task, protocol=PROTOCOL, threads=1)
     return {
-        "words": words,
-        "seed": seed,
-        "rounding": rounding,
+        **row,
         "solved": score.perturbed.success,
+        "solved_reward": score.perturbed.solved_reward,
         "normalized_reward": score.perturbed.normalized_reward,
         "survival_100N": score.robustness.survival_100N,
         "seconds": round(seconds, 1),

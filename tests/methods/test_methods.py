@@ -43,7 +43,9 @@ class TestMethods(MethodContract):
 
 def problem(task_name: str, seed: int = 0, constants: Any = None, **options: Any) -> Problem:
     task = tasks.make(task_name, **(constants or {}))
-    return Problem(task, Budget(192, 128, ENVIRONMENTS), TRAINING, options, seed, threads=1)
+    return Problem(
+        task, Budget(192, 128, ENVIRONMENTS, audit="warn"), TRAINING, options, seed, threads=1
+    )
 
 
 @pytest.mark.parametrize("name", plannable_tasks())
@@ -64,7 +66,7 @@ def test_twostage(name: str, tmp_path: Path) -> None:
     reference = ReferenceMotion.load(tmp_path / "reference.npz")
     assert reference.duration <= plan.times[-1] + 1e-9
     assert Imitation(task, reference).horizon >= 1
-    # Each failed item of the audit is shown to the user.
+    # Each failed item of the audit is shown to the user, where it does not stop the run.
     audit = task.audit(plan, reference)
     if audit.passed:
         assert desk.notes == ["plan audit: passed"]
@@ -114,6 +116,25 @@ def test_finetuning(tmp_path: Path) -> None:
     assert desk.substeps["finetune"] == 64 * 20
 
 
+def test_a_failed_audit_stops_the_run(tmp_path: Path) -> None:
+    """The plan of 192 steps does not arrive, so the run stops before physics, unless it is told to
+    go on or the budget is too small for any plan."""
+    given = problem("rocket_navigation", constants={"distance": 60.0})
+    strict = replace(given, budget=replace(given.budget, audit="stop"))
+    desk = Desk(tmp_path)
+    with pytest.raises(TsbenchError, match=r"fails its audit: .* or go on with method\.audit=warn"):
+        twostage.train(strict, desk)
+    assert [stage for stage, _ in desk.stages] == ["plan"]
+    assert (tmp_path / "plan.npz").exists()
+    desk = Desk(tmp_path)
+    twostage.train(replace(strict, options={"audit": "warn"}), desk)
+    assert [stage for stage, _ in desk.stages] == ["plan", "imitate"]
+    assert desk.notes
+    assert all(note.startswith("plan audit: ") for note in desk.notes)
+    with pytest.raises(TsbenchError, match="the plan fails its audit"):
+        twostage.train(replace(given, options={"audit": "stop"}), Desk(tmp_path))
+
+
 def test_the_papers_imitation_reward(tmp_path: Path) -> None:
     """Another form of the reward trains another policy from the same plan."""
     forms: list[Any] = [None, "progress", "paper"]
@@ -148,6 +169,7 @@ def test_the_plan_is_one_deterministic_episode() -> None:
         ("twostage", {"finetun": 0.1}, r"unknown key in method 'finetun'.*did you mean 'finetune'"),
         ("twostage", {"finetune": 1.0}, r"method.finetune must lie in \[0, 1\)"),
         ("twostage", {"finetune": "half"}, r"method.finetune must be a number"),
+        ("twostage", {"audit": "skip"}, r"method.audit must be stop, warn or null, not skip"),
         ("twostage", {"explore": -0.1}, r"method.explore must lie in \[0, 1\]"),
         ("twostage", {"imitation": "papr"}, r"'papr'.*allowed: paper, progress"),
         ("monolithic", {"finetune": 0.1}, r"unknown key in method 'finetune'"),

@@ -110,6 +110,7 @@ def test_words_win_over_the_changes_for_a_gpu() -> None:
         ([TASK, "deterministic=true"], "deterministic: true is for a GPU; on the CPU every run is"),
         ([TASK, "budget=fats"], "unknown budget 'fats'; allowed: fast, paper, smoke"),
         ([TASK, "budget=1"], "budget must be text, not 1"),
+        ([TASK, "task.budgets.smoke.audit=skip"], "task.budgets.smoke.audit must be stop or warn"),
         ([TASK, "task.budgets.fast.plan=0"], "task.budgets.fast.plan must be at least 1, not 0"),
         ([TASK, "task.budgets.fast=3"], "task.budgets.fast must be key: value pairs, not 3"),
         ([TASK, "task.training.plan=3"], "task.training.plan must be key: value pairs, not 3"),

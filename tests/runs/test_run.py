@@ -235,7 +235,7 @@ def test_another_physics_is_played_beside_and_never_kept(
     words = ["evaluate", "one", "--physics", "half_step", "--json", "two.json"]
     assert cli.main(words) == 0
     shown = capsys.readouterr().out
-    assert "verdicts that flip in physics half_step" in shown
+    assert "verdicts that change in physics half_step" in shown
     assert "compared bit for bit: equal" in shown  # the certified score
     content = json.loads(Path("two.json").read_text())
     score = plain(RunDirectory(finished).record().score.as_dict())
@@ -256,7 +256,7 @@ def test_another_physics_is_played_beside_and_never_kept(
     assert "unknown physics 'round'; allowed: elliptic, half_step, warp" in capsys.readouterr().err
     keep = ["evaluate", "one", "--protocol", quick, "--physics", "elliptic", "--keep", "board"]
     assert cli.main(keep) == 2
-    assert "--keep keeps certified scores: leave out --physics" in capsys.readouterr().err
+    assert "--keep copies scores by a protocol alone: leave out --ph" in capsys.readouterr().err
     assert not Path("board").exists()
 
 
@@ -572,6 +572,15 @@ def test_a_run_that_fails_later_keeps_what_it_has(
         execute(tmp_path / "mine")
     assert (tmp_path / "mine" / "policy.safetensors").exists()
     assert not (tmp_path / "mine" / "score.json").exists()
+
+
+def test_a_plan_that_fails_its_audit_ends_the_run(tmp_path: Path) -> None:
+    """It is no fault that resuming could mend, so the message does not offer that."""
+    with pytest.raises(TsbenchError, match=r"fails its audit: .*; the plan is in .*mine") as caught:
+        execute(tmp_path / "mine", [*WORDS, "method.audit=stop"])
+    assert "resume" not in str(caught.value)
+    assert (tmp_path / "mine" / "plan.npz").exists()
+    assert not (tmp_path / "mine" / "policy.safetensors").exists()
 
 
 # A goal so near that an episode takes 1.5 s.

@@ -36,7 +36,8 @@ pytest.importorskip("mujoco_warp", reason="needs the extra: tsbench[gpu]")
 
 import torch
 
-from tsbench.sim.warp import HostPhysics, WarpPhysics, capacity, variants
+from tsbench.sim.device import DeviceEnvironment
+from tsbench.sim.warp import HostPhysics, WarpPhysics, capacity, physics_factors, variants
 
 pytestmark = pytest.mark.warp
 
@@ -119,7 +120,9 @@ def test_worlds_have_their_own_physics(name: str) -> None:
     disturbances, count = Disturbances(mass=0.3, friction=0.5, strength=0.2), 6
     warp, _ = made(name, count, disturbances, seed=4)
     task = warp.task
-    models = variants(warp.worlds.model, disturbances, np.random.default_rng(4), count)
+    factors = physics_factors(disturbances, np.random.default_rng(4), count)
+    models = variants(warp.worlds.model, factors)
+    np.testing.assert_allclose(torch.stack(warp.unseen(), 1).numpy(), factors, rtol=1e-6)
     physics: Physics[Any] = Physics(task, count, threads=1)
     physics.batch.set_models(models)
     start = task.start(np.random.default_rng(0), 1, perturbed=True)
@@ -273,6 +276,7 @@ def test_actions_come_late_by_the_latency_of_the_episode() -> None:
     main = torch.linspace(0.6, 1.0, 5)
     late = physics._latency
     assert set(late.tolist()) == {0, 1, 2, 3}
+    assert [one.tolist() for one in physics.unseen()] == [late.tolist()]
     for step in range(5):
         state = physics.advance(
             state, torch.stack([main[step] * torch.ones(40), torch.zeros(40)], 1)
@@ -281,6 +285,18 @@ def test_actions_come_late_by_the_latency_of_the_episode() -> None:
         torch.testing.assert_close(physics.worlds.ctrl[:, 0], 50.0 * due)
     physics.begin(torch.arange(40), torch.ones(40, dtype=torch.bool))
     assert not physics._actions.any()
+
+
+def test_critics_see_what_disturbs_an_episode() -> None:
+    physics, _ = made("rocket_navigation", 6, EVERYTHING)
+    environment: Any = DeviceEnvironment(physics.task, physics, 6, 0, torch.device("cpu"))
+    observation, value = environment.reset()
+    for _ in range(3):
+        assert torch.equal(value[:, -4:], torch.stack(physics.unseen(), 1))
+        assert torch.equal(value[:, :-4], physics.task.value_observation(environment.state))
+        assert observation.shape == (6, physics.task.observation_size)
+        transition = environment.step(torch.zeros(6, 2))
+        observation, value = transition.observation, transition.value_observation
 
 
 def test_starts_are_those_of_the_task() -> None:
@@ -337,7 +353,7 @@ def test_the_command_counts_flipped_verdicts(
 ) -> None:
     words = ["evaluate", "zero", "task=rocket_navigation", "--protocol", "smoke"]
     assert cli.main([*words, "--physics", "warp"]) == 0
-    assert "verdicts that flip in physics warp" in capsys.readouterr().out
+    assert "in physics warp, which is never ranked" in capsys.readouterr().out
     monkeypatch.delitem(sys.modules, "tsbench.sim.warp")
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     assert cli.main([*words, "--physics", "warp"]) == 2

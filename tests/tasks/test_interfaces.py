@@ -184,7 +184,7 @@ def problem(task: Task[Any], tmp_path: Path) -> tuple[Problem, Any]:
     )
     settings = {"environments": 4, "rollout": 8, "minibatches": 2, "hidden": [8]}
     training = dict.fromkeys(("plan", "imitate", "task"), settings)
-    return Problem(task, Budget(64, 64), training, {}, seed=0, threads=1), desk
+    return Problem(task, Budget(64, 64, audit="warn"), training, {}, seed=0, threads=1), desk
 
 
 def test_a_task_without_a_planning_variant_can_be_learned_scored_and_seen(tmp_path: Path) -> None:

@@ -22,6 +22,11 @@ class TsbenchError(Exception):
         super().__init__(" ".join(message.splitlines()))
 
 
+class PlanError(TsbenchError):
+    """A plan fails its audit, so nothing is to be learned from it. To resume the run would give the
+    same plan again."""
+
+
 class NotFiniteError(TsbenchError):
     """A computation has produced a number that is not finite.
 

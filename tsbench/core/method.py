@@ -10,6 +10,8 @@ from typing import Any, Protocol
 
 from tsbench.core.task import Task
 
+AUDITS = ("stop", "warn")
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -21,11 +23,24 @@ class Budget:
             stage may use both (paper: monolithic gets the sum).
         environments: limit on the environments stepped together, which overrides larger numbers in
             the training settings; None for no limit.
+        audit: what a plan that fails its audit does to the run: "stop" ends it, "warn" goes on. No
+            plan of a budget of seconds passes, so such budgets say "warn".
+
+    Raises:
+        ValueError: a value out of range. The message begins with its name.
     """
 
     plan: int
     act: int
     environments: int | None = None
+    audit: str = "stop"
+
+    def __post_init__(self) -> None:
+        for name in ("plan", "act", "environments"):
+            if (amount := getattr(self, name)) is not None and amount < 1:
+                raise ValueError(f"{name} must be at least 1, not {amount}")
+        if self.audit not in AUDITS:
+            raise ValueError(f"audit must be stop or warn, not {self.audit}")
 
 
 @dataclass(frozen=True)

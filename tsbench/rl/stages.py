@@ -10,9 +10,10 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any
 
-from tsbench.core.errors import TsbenchError
-from tsbench.core.method import Monitor, Problem, Workspace
-from tsbench.core.task import SimulatedTask
+from tsbench.core.errors import PlanError, TsbenchError
+from tsbench.core.method import AUDITS, Monitor, Problem, Workspace
+from tsbench.core.motion import Plan, ReferenceMotion
+from tsbench.core.task import SimulatedTask, plannable
 from tsbench.core.typed import typed_items
 from tsbench.rl import processes
 from tsbench.rl.devices import CPU, torch_device, working_on
@@ -23,6 +24,7 @@ from tsbench.sim.device import DeviceDynamics, DeviceEnvironment, DeviceKinemati
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.physics import Physics
+from tsbench.sim.tracking import Imitation
 
 Environment = BatchedEnvironment[Any] | DeviceEnvironment[Any]
 
@@ -163,6 +165,69 @@ def physics_environment(
         deterministic=problem.deterministic,
     )
     return DeviceEnvironment(task, dynamics, count, seed, device)
+
+
+@dataclass(frozen=True)
+class ImitationOptions:
+    """Options of a method that imitates a plan.
+
+    Attributes:
+        imitation: form of the imitation reward, None for the task's default.
+        finetune: share of the physics budget spent on the task's own reward at the end.
+        audit: what a plan that fails its audit does: "stop" ends the run, "warn" goes on; None for
+            what the budget says.
+    """
+
+    imitation: str | None = None
+    finetune: float = 0.0
+    audit: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.finetune < 1.0:
+            raise ValueError(f"finetune must lie in [0, 1), not {self.finetune}")
+        if self.audit not in (None, *AUDITS):
+            raise ValueError(f"audit must be stop, warn or null, not {self.audit}")
+
+
+def learn_imitation(
+    problem: Problem, workspace: Workspace, plan: Plan, options: ImitationOptions
+) -> Learner:
+    """Turns a plan into a reference motion, audits both, and learns to imitate the motion by PPO,
+    with the whole physics budget. Saves `plan.npz` and `reference.npz`.
+
+    Raises:
+        TsbenchError: the task has no planning variant, or no such form of the imitation reward.
+        PlanError: the plan fails its audit, and that stops the run.
+    """
+    task, act = plannable(problem.task), problem.budget.act
+    plan.save(workspace.directory / "plan.npz")
+    reference = task.reference(plan)
+    reference.save(workspace.directory / "reference.npz")
+    _audit(problem, workspace, plan, reference, options.audit or problem.budget.audit)
+    finetuning = round(options.finetune * act)
+    imitation = Imitation(task, reference, options.imitation)
+    learner = learn_physics(problem, workspace, "imitate", imitation, "imitate", act - finetuning)
+    if finetuning:
+        learner = learn_physics(
+            problem, workspace, "finetune", task, "finetune", finetuning, start_from=learner
+        )
+    return learner
+
+
+def _audit(
+    problem: Problem, workspace: Workspace, plan: Plan, reference: ReferenceMotion, failed: str
+) -> None:
+    audit = plannable(problem.task).audit(plan, reference)
+    if audit.passed:
+        workspace.note("plan audit: passed")
+    elif failed == "warn":
+        for item in audit.failures:
+            workspace.note(f"plan audit: {item}")
+    else:
+        found = "; ".join(map(str, audit.failures))
+        raise PlanError(
+            f"the plan fails its audit: {found}; plan more steps, or go on with method.audit=warn"
+        )
 
 
 def _reporting(

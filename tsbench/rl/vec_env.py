@@ -193,7 +193,7 @@ class TorchEnvironment(LearnerEnvironment):
         self._length[:] = episodes["length"]
 
     def _tensors(self, observation: np.ndarray) -> TensorDict:
-        value = self.mdp.value_observation(self.environment.state)
+        value = self.environment.value_observation()
         encoded = {"policy": self._encode(observation), "value": self._encode(value)}
         tensors = {name: _floats(group) for name, group in encoded.items()}
         return TensorDict(tensors, batch_size=[self.num_envs])

@@ -130,10 +130,6 @@ class RunConfig:
             raise TsbenchError("deterministic: true is for a GPU; on the CPU every run is")
         if self.budget not in self.task.budgets:
             raise unknown("budget", self.budget, self.task.budgets)
-        for name, amount in vars(self.task.budgets[self.budget]).items():
-            if amount is not None and amount < 1:
-                key = f"task.budgets.{self.budget}.{name}"
-                raise TsbenchError(f"{key} must be at least 1, not {amount}")
 
 
 class PluginConfigurations(SearchPathPlugin):

@@ -20,7 +20,14 @@ import numpy as np
 from rich.console import Console
 
 from tsbench import methods, tasks
-from tsbench.core.errors import NotFiniteError, Stopped, TsbenchError, memory_errors, os_errors
+from tsbench.core.errors import (
+    NotFiniteError,
+    PlanError,
+    Stopped,
+    TsbenchError,
+    memory_errors,
+    os_errors,
+)
 from tsbench.core.files import PART, taken, write_json, write_whole
 from tsbench.core.method import Problem
 from tsbench.core.typed import unknown_key
@@ -219,6 +226,8 @@ def _explained(run: RunDirectory) -> Iterator[None]:
             yield
     except NotFiniteError as error:
         raise TsbenchError(f"{error}{_dumped(run.dump_file, error)}") from error
+    except PlanError as error:
+        raise TsbenchError(f"{error}; the plan is in {run.path}") from error
     except TsbenchError as error:
         raise TsbenchError(f"{error}{_way_on(run)}") from error
     except Stopped as stopped:

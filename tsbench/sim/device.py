@@ -67,6 +67,9 @@ class DeviceDynamics(Protocol[S]):
     def advance(self, state: S, action: Tensor) -> S:
         """The states one time step later."""
 
+    def unseen(self) -> tuple[Tensor, ...]:
+        """As `Dynamics.unseen`, each of shape (n,), float32."""
+
     def check(self) -> None:
         """Called after each rollout; may wait for the device.
 
@@ -330,7 +333,8 @@ class DeviceEnvironment(Generic[S]):
         self._wrong = torch.zeros(
             (self.count, len(self._quantities)), dtype=torch.bool, device=self.device
         )
-        return self.mdp.observation(self.state), self.mdp.value_observation(self.state)
+        value = self._with_unseen(self.mdp.value_observation(self.state))
+        return self.mdp.observation(self.state), value
 
     @torch.inference_mode()
     def step(self, action: Tensor) -> DeviceTransition[S]:
@@ -355,7 +359,7 @@ class DeviceEnvironment(Generic[S]):
             self._wrong = judged.wrong
         return DeviceTransition(
             observation=observation,
-            value_observation=value,
+            value_observation=self._with_unseen(value),
             reward=judged.reward,
             terminal=judged.terminal,
             truncated=judged.truncated,
@@ -363,6 +367,10 @@ class DeviceEnvironment(Generic[S]):
             spared=judged.spared,
             quality=judged.quality,
         )
+
+    def _with_unseen(self, value: Tensor) -> Tensor:
+        unseen = self.dynamics.unseen()
+        return torch.column_stack([value, *unseen]) if unseen else value
 
     def _draw(self) -> Tensor:
         """The number of the start that each row takes if an episode begins in it."""
@@ -479,6 +487,9 @@ class DeviceKinematics(Generic[S]):
 
     def advance(self, state: S, action: Tensor) -> S:
         return self._advance(state, action)
+
+    def unseen(self) -> tuple[Tensor, ...]:
+        return ()
 
     def check(self) -> None:
         """Kinematics cannot fail."""

@@ -128,6 +128,9 @@ class Physics(Generic[S]):
         """qpos (n, nq) and qvel (n, nv) of all simulations."""
         return self._qpos.copy(), self._qvel.copy()
 
+    def unseen(self) -> tuple[np.ndarray, ...]:
+        return ()
+
     def warned(self) -> dict[str, int]:
         """Number of mujoco warnings by mujoco's name of their kind; kinds that never came are left
         out."""

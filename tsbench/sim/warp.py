@@ -86,7 +86,7 @@ _CONTACTS = 8
 _MOST_CONTACTS = 128  # of a world; models in which more could touch at once hardly ever have more
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _apply_pushes(
     time: wp.array[float],
     first: wp.array[float],
@@ -110,7 +110,7 @@ def _apply_pushes(
     applied[i, body] = wp.spatial_vector(share * force[i, number], wp.vec3(0.0))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _disturb(
     begins: wp.array[wp.bool],
     seed: int,
@@ -148,7 +148,7 @@ def _disturb(
     latency[i] = wp.int64(wp.randi(rng, 0, latest + 1))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _look_for_divergence(
     rest: wp.array2d[float],
     qpos: wp.array2d[float],
@@ -494,6 +494,7 @@ class WarpPhysics(Generic[S]):
         self._substeps = self.plant.substeps * (change or Change()).refine
         model = _model(task, change)
         rng = np.random.default_rng(seed)
+        factors = physics_factors(disturbances, rng, count)
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
         self.worlds = Worlds(
             model,
@@ -503,7 +504,7 @@ class WarpPhysics(Generic[S]):
             timestep=task.timestep,
             substeps=self._substeps,
             pushes=pushes if disturbances.push else 1,
-            variants=variants(model, disturbances, rng, count),
+            variants=variants(model, factors),
             deterministic=deterministic,
             contacts=contacts,
             rows=rows,
@@ -532,6 +533,8 @@ class WarpPhysics(Generic[S]):
             wp.from_torch(self._latency),
         ]
         self._count = wp.from_torch(self._steps)
+        of_world = factors[np.arange(count) % len(factors)] if len(factors) else np.ones((count, 0))
+        self._factors = tuple(self._tensor(column) for column in of_world.T)
         # What only computes, as graphs of its own on a GPU.
         self._controlled = Replayed(self.plant.control, self.device)
         self._followed = Replayed(self._follow, self.device)
@@ -610,6 +613,11 @@ class WarpPhysics(Generic[S]):
             )
         )
         return merged(diverged, state, following)
+
+    def unseen(self) -> tuple[torch.Tensor, ...]:
+        """As `DisturbedPhysics.unseen`, each of shape (n,), float32."""
+        late = (self._latency.float(),) if self.disturbances.latency else ()
+        return (*self._factors, *late)
 
     def check(self) -> None:
         """Waits for the device. To be called once in a while, such as once a rollout.
@@ -804,14 +812,18 @@ def _model(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
     return model
 
 
-def variants(
-    model: mujoco.MjModel, disturbances: Disturbances, rng: Rng, count: int
-) -> list[mujoco.MjModel]:
-    """Models of disturbed mass, friction and strength; none where nothing disturbs them."""
+def physics_factors(disturbances: Disturbances, rng: Rng, count: int) -> np.ndarray:
+    """Factors of mass, friction and strength, shape (p, 3), p at most `count` and `PHYSICS`; none
+    where nothing disturbs them."""
     bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
     if not any(bounds):
-        return []
-    factors = 1.0 + rng.uniform(-1.0, 1.0, (min(count, PHYSICS), 3)) * bounds
+        return np.ones((0, 3))
+    factors: np.ndarray = 1.0 + rng.uniform(-1.0, 1.0, (min(count, PHYSICS), 3)) * bounds
+    return factors
+
+
+def variants(model: mujoco.MjModel, factors: np.ndarray) -> list[mujoco.MjModel]:
+    """Models with other mass, friction and strength, one for each row of `factors` (p, 3)."""
     models = [copy.copy(model) for _ in factors]
     for one, (mass, friction, strength) in zip(models, factors, strict=True):
         Change(mass, friction, strength).apply(one)

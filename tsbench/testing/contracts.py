@@ -401,7 +401,7 @@ class MethodContract:
     names: ClassVar[Sequence[str]] = ()
     task: ClassVar[str]
     constants: ClassVar[Mapping[str, Any]] = {}
-    budget: ClassVar[Budget] = Budget(192, 128, 8)
+    budget: ClassVar[Budget] = Budget(192, 128, 8, audit="warn")
     training: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         kind: {"rollout": 8, "epochs": 1, "minibatches": 2, "hidden": [16]}
         for kind in ("plan", "imitate", "task", "finetune")
