@@ -25,7 +25,7 @@ run() { # NAME SECONDS COMMAND...
 
 train() { # NAME SECONDS WORDS...
     run "$1" "$2" python3 -m tsbench run "${@:3}" device=cuda threads="$threads" \
-        task.budgets.fast.audit=warn directory="$runs/$1"
+        ++task.budgets.fast.audit=warn directory="$runs/$1"
     tar -czf "$out/runs.tgz" -C "$runs" .
 }
 
