@@ -37,7 +37,7 @@ pytest.importorskip("mujoco_warp", reason="needs the extra: tsbench[gpu]")
 import torch
 
 from tsbench.sim.device import DeviceEnvironment
-from tsbench.sim.warp import HostPhysics, WarpPhysics, capacity, physics_factors, variants
+from tsbench.sim.warp import HostPhysics, WarpPhysics, Worlds, capacity, physics_factors, variants
 
 pytestmark = pytest.mark.warp
 
@@ -373,6 +373,63 @@ def test_devices_that_there_are_not() -> None:
         make(device="cuda:99")
     with pytest.raises(TsbenchError, match="runs on cpu or cuda, not on meta"):
         make(device="meta")
+
+
+SENSORS = """
+<mujoco>
+  <option timestep="0.01" integrator="Euler"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <body name="ball" pos="0 0 0.3">
+      <freejoint/>
+      <geom name="ball" type="sphere" size="0.1" mass="1"/>
+      <site name="here" pos="0.05 0 0"/>
+      <body pos="0.1 0 0">
+        <joint name="arm" type="hinge" axis="0 1 0" range="-0.5 0.5" limited="true"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0" mass="0.2" contype="0"
+              conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="arm" gear="3"/></actuator>
+  <sensor>
+    <jointpos joint="arm"/> <jointvel joint="arm"/> <jointlimitpos joint="arm"/>
+    <framepos objtype="site" objname="here"/> <framelinvel objtype="site" objname="here"/>
+    <accelerometer site="here"/> <gyro site="here"/> <velocimeter site="here"/>
+    <subtreecom body="ball"/> <distance geom1="ball" geom2="floor" cutoff="2"/>
+    <touch site="here"/>
+  </sensor>
+</mujoco>
+"""
+
+
+def test_sensors_of_any_kind_are_current() -> None:
+    """After three physics steps, positions and velocities are those at the end, and accelerations
+    those of the last step."""
+    model = mujoco.MjModel.from_xml_string(SENSORS)
+    data = mujoco.MjData(model)
+    worlds = Worlds(model, 1, device=torch.device("cpu"), pushed="ball", timestep=0.03, substeps=3)
+    data.qvel[:3] = worlds.qvel[0, :3] = torch.tensor([0.4, -0.2, 0.1])
+    data.ctrl[:] = 1.0
+    worlds.ctrl[:] = 1.0
+    for _ in range(12):
+        for _ in range(3):
+            mujoco.mj_step(model, data)
+        lagging = data.sensordata.copy()
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_sensorPos(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_sensorVel(model, data)
+        worlds.step()
+        found = worlds.sensordata[0].numpy()
+        for sensor in range(model.nsensor):
+            address, size = model.sensor_adr[sensor], model.sensor_dim[sensor]
+            lags = model.sensor_needstage[sensor] == mujoco.mjtStage.mjSTAGE_ACC
+            values = slice(address, address + size)
+            wanted = (lagging if lags else data.sensordata)[values]
+            np.testing.assert_allclose(found[values], wanted, atol=0.02 if lags else 5e-4)
+    assert not worlds.diverged.any()
+    worlds.check()
 
 
 def test_sensors_of_a_model_are_current() -> None:

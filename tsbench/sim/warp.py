@@ -86,6 +86,23 @@ _CONTACTS = 8
 _MOST_CONTACTS = 128  # of a world; models in which more could touch at once hardly ever have more
 
 
+_DISTANCE_SENSORS = (
+    mujoco.mjtSensor.mjSENS_GEOMDIST,
+    mujoco.mjtSensor.mjSENS_GEOMNORMAL,
+    mujoco.mjtSensor.mjSENS_GEOMFROMTO,
+)
+_PLACE_SENSORS = (
+    mujoco.mjtSensor.mjSENS_JOINTPOS,
+    mujoco.mjtSensor.mjSENS_BALLQUAT,
+    mujoco.mjtSensor.mjSENS_FRAMEPOS,
+    mujoco.mjtSensor.mjSENS_FRAMEQUAT,
+    mujoco.mjtSensor.mjSENS_FRAMEXAXIS,
+    mujoco.mjtSensor.mjSENS_FRAMEYAXIS,
+    mujoco.mjtSensor.mjSENS_FRAMEZAXIS,
+    mujoco.mjtSensor.mjSENS_SUBTREECOM,
+)
+
+
 @wp.kernel(enable_backward=False)
 def _apply_pushes(
     time: wp.array[float],
@@ -184,6 +201,15 @@ def _look_for_divergence(
             act[i, k] = 0.0
 
 
+@wp.kernel(enable_backward=False)
+def _clear(lags: wp.array[wp.bool], sensordata: wp.array2d[float]) -> None:
+    """Zeros for sensors that write only what they sense, but not for those that lag."""
+    i = wp.tid()
+    for k in range(sensordata.shape[1]):
+        if not lags[k]:
+            sensordata[i, k] = 0.0
+
+
 class Worlds:
     """n simulations of a model on one device, all stepped together.
 
@@ -260,6 +286,10 @@ class Worlds:
             self._duration = wp.zeros(count, dtype=float)
             self._force = wp.zeros((count, pushes), dtype=wp.vec3)
             self._diverged = wp.zeros(count, dtype=wp.bool)
+            lags = np.repeat(
+                model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC, model.sensor_dim
+            )
+            self._lagging, self._lags = bool(lags.any()), wp.array(lags, dtype=wp.bool)
         self.qpos, self.qvel = wp.to_torch(self._d.qpos), wp.to_torch(self._d.qvel)
         self.ctrl, self.sensordata = wp.to_torch(self._d.ctrl), wp.to_torch(self._d.sensordata)
         self.time, self.force = wp.to_torch(self._time), wp.to_torch(self._force)
@@ -279,7 +309,7 @@ class Worlds:
     def look(self) -> None:
         """Brings the sensors up to date with `qpos` and `qvel`."""
         with self._stream():
-            mjw.step1(self._m, self._d)
+            self._sense()
 
     def readings(self, time: torch.Tensor, memory: torch.Tensor) -> Readings:
         """Copies of what a task reads, because the next step overwrites the arrays."""
@@ -364,21 +394,39 @@ class Worlds:
         inputs = [self._time, self._first, self._interval, self._duration, self._force]
         outputs = [d.xfrc_applied]
         wp.launch(_apply_pushes, d.nworld, [*inputs, self._timestep, self._body], outputs)
-        # Only the last substep's sensors are read: those of accelerations, which lag by a substep.
+        # Sensors of accelerations lag by a substep: the last one measures them. `_sense` reads the
+        # others at its end.
         flags = m.opt.disableflags
-        m.opt.disableflags = flags | mjw.DisableBit.SENSOR
         for substep in range(self._substeps):
-            if substep == self._substeps - 1:
-                m.opt.disableflags = flags
+            if not self._lagging or substep < self._substeps - 1:
+                m.opt.disableflags = flags | mjw.DisableBit.SENSOR
             mjw.step(m, d)
+            m.opt.disableflags = flags
         wp.launch(
             _look_for_divergence,
             d.nworld,
             [m.qpos0],
             [d.qpos, d.qvel, d.qacc, d.act, self._diverged],
         )
-        if self._sensors:
-            mjw.step1(m, d)
+        self._sense()
+
+    def _sense(self) -> None:
+        """Sensors of positions and velocities, at the current ones."""
+        m, d, types = self._m, self._d, self.model.sensor_type
+        if not len(types):
+            return
+        if np.isin(types, (*_PLACE_SENSORS, *_DISTANCE_SENSORS)).all():
+            # They need no more than positions, and the contacts that measure distances.
+            mjw.fwd_kinematics(m, d)
+            if np.isin(types, _DISTANCE_SENSORS).any():
+                mjw.collision(m, d)
+            mjw.sensor_pos(m, d)
+            return
+        mjw.fwd_position(m, d, factorize=False)
+        wp.launch(_clear, d.nworld, [self._lags], [d.sensordata])
+        mjw.sensor_pos(m, d)
+        mjw.fwd_velocity(m, d)
+        mjw.sensor_vel(m, d)
 
 
 def capacity(model: mujoco.MjModel) -> tuple[int, int]:
@@ -403,13 +451,6 @@ def capacity(model: mujoco.MjModel) -> tuple[int, int]:
     rows = touching * int(sides) + limits + frictions + 6 * model.neq
     # Not zero: recorded on a CPU, mujoco-warp's step without room for constraints moves nothing.
     return max(touching + measured, 1), max(rows, 1)
-
-
-_DISTANCE_SENSORS = (
-    mujoco.mjtSensor.mjSENS_GEOMDIST,
-    mujoco.mjtSensor.mjSENS_GEOMNORMAL,
-    mujoco.mjtSensor.mjSENS_GEOMFROMTO,
-)
 
 
 def _may_touch(model: mujoco.MjModel, one: int, two: int) -> bool:
