@@ -6,7 +6,7 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -211,6 +211,7 @@ def _list(words: Sequence[str]) -> None:
             if (provider := kind.provider(name)) not in (None, plugins.own()):
                 brought.setdefault(str(provider), []).append(name)
     refused = tuple(dict.fromkeys((*tasks.refused(), *methods.refused())))
+    incomplete = (*config.incomplete(), *_broken_promises(made))
     offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for header in ("task", "version", "seconds", *offered):
@@ -227,10 +228,27 @@ def _list(words: Sequence[str]) -> None:
         table.add_row(name, summary)
     console.print(table)
     lines = [f"Plug-in {provider}: {', '.join(names)}" for provider, names in brought.items()]
-    for line in (*lines, *(f"Refused: {line}" for line in refused)):
+    lines += [f"Refused: {line}" for line in refused]
+    lines += [f"Incomplete: {line}" for line in incomplete]
+    for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     shown = {"tasks": rows, "methods": summaries, "plug-ins": brought, "refused": refused}
-    write_json(options.json, shown)
+    write_json(options.json, {**shown, "incomplete": incomplete})
+
+
+def _broken_promises(made: Mapping[str, Any]) -> Iterator[str]:
+    """A line for each task of a plug-in that breaks a promise; the contract tests of tsbench check
+    its own."""
+    from tsbench import tasks
+    from tsbench.core import plugins
+    from tsbench.sim.promises import check_promises
+
+    for name, task in made.items():
+        if tasks.provider(name) != plugins.own():
+            try:
+                check_promises(name, task)
+            except TsbenchError as error:
+                yield str(error)
 
 
 def _short(steps: int) -> str:
@@ -387,7 +405,7 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
         if path.exists() or str(path) in references.POLICIES:
             raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
         raise TsbenchError(f"no run directory {path}")
-    task = tasks.make(name)
+    task = tasks.checked(name)
     return references.named(path, task) or foreign.load(path, task, trust_sb3), task
 
 

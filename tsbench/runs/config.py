@@ -199,6 +199,21 @@ def names(group: str) -> tuple[str, ...]:
     return tuple(sorted(_files(group)))
 
 
+def incomplete() -> tuple[str, ...]:
+    """A line for each task and method that can be made but not run, since it has no configuration
+    of its name."""
+    return tuple(
+        _lacking(group, name)
+        for group, registry in (("task", tasks), ("method", methods))
+        for name in registry.names()
+        if name not in _files(group)
+    )
+
+
+def _lacking(group: str, name: str) -> str:
+    return f"the {group} {name!r} cannot be run: its package lacks conf/{group}/{name}.yaml"
+
+
 def budgets(task: str) -> dict[str, Budget]:
     """The budgets that a task's configuration offers; none without a configuration.
 
@@ -239,9 +254,7 @@ def one_line_errors() -> Iterator[None]:
         parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
         registry = {"task": tasks, "method": methods}.get(parts[0])
         if registry is not None and parts[2] in registry.names():
-            raise TsbenchError(
-                f"the {parts[0]} {parts[2]!r} cannot be run: its package lacks conf/{missing}.yaml"
-            ) from None
+            raise TsbenchError(_lacking(parts[0], parts[2])) from None
         raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__
