@@ -52,6 +52,24 @@ examples:
 """
 
 
+TUNE_HELP = """\
+usage: tsbench tune task=NAME method=NAME trials=N [study=PATH] [key=value ...] [options]
+
+Finds good settings of a method by Optuna's multivariate TPE, and prints the words of the best ones.
+Processes that are given the same words work on one study together, and a study goes on where it
+was interrupted. docs/tuning.md says what a trial is and what it is worth.
+
+words:
+  trials=N         trials of the whole study, pruned and failed ones among them
+  study=PATH       directory of the journal and the runs (studies/TASK/METHOD-BUDGET)
+  task=, method=, budget=, threads=, key=value
+                   as of `tsbench run`, for all trials; a key that is given is not tuned
+
+options:
+  --best           only print the words of the best trial so far
+  --json FILE      write them to a new JSON file too, with the number of trials spent
+"""
+
 JSON_HELP = "write what is shown to a new JSON file too"
 PICTURES = ("--video", "--strip")  # options that need OpenGL
 
@@ -492,6 +510,42 @@ def _report(words: Sequence[str]) -> None:
     sys.stdout.write(f"{path}\n")
 
 
+def _tune(words: Sequence[str]) -> None:
+    if "-h" in words or "--help" in words:
+        sys.stdout.write(TUNE_HELP)
+        return
+    try:
+        from tsbench.runs import tune
+    except ModuleNotFoundError as error:
+        if error.name != "optuna":
+            raise
+        raise TsbenchError("optuna is missing: pip install 'tsbench[tune]'") from None
+    from tsbench.core.files import write_json
+
+    parser = Parser("tsbench tune", add_help=False, allow_abbrev=False)
+    parser.add_argument("--best", action="store_true")
+    parser.add_argument("--json", type=_new_file)
+    options, others = parser.parse_known_args(words)
+    own = {"trials": "", "study": ""}
+    for key in own:
+        own[key] = next((w.partition("=")[2] for w in others if w.startswith(f"{key}=")), "")
+    common = [word for word in others if not word.startswith(tuple(f"{key}=" for key in own))]
+    study = tune.prepare(common, Path(own["study"]) if own["study"] else None)
+    if not options.best:
+        if not own["trials"]:
+            raise TsbenchError("trials=N is missing, the number of trials of the whole study")
+        try:
+            trials = _whole_number(own["trials"], 1, 10**6)
+        except argparse.ArgumentTypeError as error:
+            raise TsbenchError(f"trials {error}") from None
+        tune.tune(study, trials, told=lambda line: sys.stderr.write(f"{line}\n"))
+    trial, spent = tune.best(study)
+    chosen = study.chosen(trial.params)
+    sys.stdout.write(f"tsbench run {' '.join(chosen)}\n")
+    figures = {"words": chosen, "value": trial.value, "trial": trial.number, "trials": spent}
+    write_json(options.json, {**figures, "seeds": study.seeds})
+
+
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
     parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
@@ -514,6 +568,7 @@ VERBS = {
     "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
     "view": Verb("see a run, a plan or a task move: live, as a page or as a video", _view),
     "report": Verb("write one page about a run: what was planned, done and learned", _report),
+    "tune": Verb("find good settings for a method, with others sharing the work", _tune),
     "bench": Verb("measure how fast it is, side by side with others", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }
