@@ -248,6 +248,18 @@ def test_a_broken_promise_is_listed_and_refused(toy: Toy, tmp_path: Path) -> Non
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_configuration_of_another_name(toy: Toy, tmp_path: Path) -> None:
+    """It is told by `tsbench run` and by `tsbench list`, which goes on to show the others."""
+    file = toy.folder / "conf" / "task" / "toy_flight.yaml"
+    file.write_text(file.read_text().replace("name: toy_flight", "name: flight"))
+    line = "conf/task/toy_flight.yaml must have name: toy_flight, not flight"
+    done = call(tmp_path, *RUN)
+    assert (done.returncode, done.stderr) == (2, f"tsbench: {line}\n")
+    content = listed(tmp_path)
+    assert content["incomplete"] == [line]
+    assert content["tasks"].keys() == set(tasks.names())
+
+
 @pytest.mark.parametrize("file", ["__init__.py", "task.py"])
 def test_a_broken_plugin_breaks_nothing_else(file: str, toy: Toy, tmp_path: Path) -> None:
     (toy.folder / file).write_text("import nothing_of_that_name\n")

@@ -6,7 +6,7 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -210,9 +210,16 @@ def _list(words: Sequence[str]) -> None:
     from tsbench.core import plugins
     from tsbench.core.files import write_json
     from tsbench.runs import config
+    from tsbench.sim.promises import check_promises
 
-    made = {name: tasks.make(name) for name in tasks.names()}
-    budgets = {name: config.budgets(name) for name in made}
+    made, budgets, faults = {}, {}, []
+    for name in tasks.names():
+        try:
+            made[name], budgets[name] = tasks.make(name), config.budgets(name)
+            if tasks.provider(name) != plugins.own():  # the contract tests check tsbench's own
+                check_promises(name, made[name])
+        except TsbenchError as error:
+            faults.append(str(error))
     rows = {
         name: {
             "version": task.version,
@@ -229,7 +236,7 @@ def _list(words: Sequence[str]) -> None:
             if (provider := kind.provider(name)) not in (None, plugins.own()):
                 brought.setdefault(str(provider), []).append(name)
     refused = tuple(dict.fromkeys((*tasks.refused(), *methods.refused())))
-    incomplete = (*config.incomplete(), *_broken_promises(made))
+    incomplete = (*config.incomplete(), *faults)
     offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for header in ("task", "version", "seconds", *offered):
@@ -252,21 +259,6 @@ def _list(words: Sequence[str]) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     shown = {"tasks": rows, "methods": summaries, "plug-ins": brought, "refused": refused}
     write_json(options.json, {**shown, "incomplete": incomplete})
-
-
-def _broken_promises(made: Mapping[str, Any]) -> Iterator[str]:
-    """A line for each task of a plug-in that breaks a promise; the contract tests of tsbench check
-    its own."""
-    from tsbench import tasks
-    from tsbench.core import plugins
-    from tsbench.sim.promises import check_promises
-
-    for name, task in made.items():
-        if tasks.provider(name) != plugins.own():
-            try:
-                check_promises(name, task)
-            except TsbenchError as error:
-                yield str(error)
 
 
 def _short(steps: int) -> str:

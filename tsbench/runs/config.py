@@ -142,7 +142,16 @@ def compose(words: Sequence[str]) -> RunConfig:
             node = hydra_compose("config", overrides=opened(words))
     except ValueError as error:  # Hydra raises it where the value of a group is not a name
         raise TsbenchError(f"{_flat(error)} (in: {' '.join(words)})") from None
-    return parse(node)
+    config = parse(node)
+    files = {override.key_or_group: override.value() for override in overrides}
+    for group, name in (("task", config.task.name), ("method", config.method["name"])):
+        _check_name(group, files.get(group, name), name)
+    return config
+
+
+def _check_name(group: str, file: str, name: str) -> None:
+    if name != file:
+        raise TsbenchError(f"conf/{group}/{file}.yaml must have name: {file}, not {name}")
 
 
 def parse(node: DictConfig) -> RunConfig:
@@ -226,6 +235,7 @@ def budgets(task: str) -> dict[str, Budget]:
     with one_line_errors():
         plain = OmegaConf.to_container(OmegaConf.create(file.read_text("utf-8")), resolve=True)
     config: TaskConfig = typed(TaskConfig, plain, "task")
+    _check_name("task", task, config.name)
     return config.budgets
 
 
