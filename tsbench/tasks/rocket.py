@@ -19,9 +19,10 @@ from tsbench.core.arrays import Array, array_namespace, like
 from tsbench.core.constants import constant
 from tsbench.core.drawing import Drawing, Flame
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.roadmap import RoadmapSpace
 from tsbench.core.state import Course, Readings, Rng, Start, State
 from tsbench.core.task import Abstraction, Plannable, Tracker
-from tsbench.planning.path import Path
+from tsbench.planning.path import Path, segment_distance
 from tsbench.sim.model import load_spec
 from tsbench.tasks import register
 
@@ -61,6 +62,8 @@ C = Constants()
 
 # The paper prints degrees; spec section 1 says why this is in radians.
 PLAN_TURN = 0.05  # rad per plan step (P, unit D)
+
+ROADMAP_SLACK = 1e-6  # m, by which the ways of a roadmap clear obstacles more than they must
 
 # Constants of the imitation reward, on which no score depends.
 TRACKING_DECAY = -0.625  # k_imi (P)
@@ -457,6 +460,35 @@ class RocketAbstraction(Abstraction[RocketState]):
 
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
         return coordinates
+
+    def roadmap_space(self) -> RocketSpace:
+        return RocketSpace(self.task)
+
+
+class RocketSpace(RoadmapSpace[RocketState]):
+    """Positions in metres. The rocket stays upright: neither clearance nor reward depends on its
+    angle."""
+
+    def __init__(self, task: Rocket) -> None:
+        self.obstacles = np.array(task.obstacles).reshape(-1, 2)
+        self.low, self.high = task.bounds
+        self.scale = np.full(2, C.plan_step)
+        self.start, self.goal = np.zeros(2), task.goal
+
+    def free(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """The whole way is farther from all obstacles than the audit of plans asks for."""
+        clear = np.ones(len(first), bool)
+        for obstacle in self.obstacles:
+            distance = segment_distance(obstacle, first, second)
+            clear &= distance >= C.obstacle_radius + C.hull_radius + ROADMAP_SLACK
+        return clear
+
+    def action(self, state: RocketState, point: np.ndarray) -> np.ndarray:
+        move = (point - state.position) / C.plan_step
+        return np.concatenate([move, np.zeros((1, 1))], axis=-1)
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        return np.insert(points, 1, 0.0, axis=-1)
 
 
 class RocketTracker(Tracker[RocketState]):
