@@ -45,7 +45,7 @@ class Options(ImitationOptions):
         if self.roadmap not in ROADMAPS:
             raise ValueError(f"roadmap must be one of {', '.join(ROADMAPS)}, not {self.roadmap}")
         if not 0 <= self.samples <= 1_000_000:
-            raise ValueError(f"samples must be at most 1,000,000, not {self.samples}")
+            raise ValueError(f"samples must lie in 0 to 1,000,000, not {self.samples}")
         if not 1 <= self.neighbours <= 1000:
             raise ValueError(f"neighbours must lie in 1 to 1000, not {self.neighbours}")
 
