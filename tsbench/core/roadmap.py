@@ -9,7 +9,7 @@ from typing import Generic
 
 import numpy as np
 
-from tsbench.core.state import S
+from tsbench.core.state import S, Start
 
 
 class RoadmapSpace(ABC, Generic[S]):
@@ -48,6 +48,30 @@ class RoadmapSpace(ABC, Generic[S]):
         points (..., d). By default each coordinate has a speed limit of its own."""
         steps: np.ndarray = np.max(np.abs(second - first) / self.scale, axis=-1)
         return steps
+
+
+class DrivableSpace(RoadmapSpace[S]):
+    """A roadmap space whose points are goals like the task's own: a policy that flies or drives to
+    the goal can be sent to any of them.
+
+    Attributes:
+        near: metres from a point that count as there.
+    """
+
+    near: float
+
+    @abstractmethod
+    def points(self, state: S) -> np.ndarray:
+        """Where the robot is, shape (n, d), in states (n,)."""
+
+    @abstractmethod
+    def sent(self, state: S, points: np.ndarray) -> S:
+        """The states moved along with the world so that `points`, shape (n, d) or (d,), come to lie
+        at the goal. What a policy for the task sees there, it has to see to go to the points."""
+
+    @abstractmethod
+    def moved(self, start: Start, points: np.ndarray) -> Start:
+        """The task's starts (n,) moved to `points`, shape (n, d) or (d,)."""
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,9 @@ class Graph:
     costs: np.ndarray
     checked: int
 
-    def quickest(self, first: int, last: int) -> np.ndarray | None:
-        """The points on the cheapest way between two points, shape (k, d), by Dijkstra's algorithm;
-        None if there is no way."""
+    def quickest(self, first: int, last: int) -> list[int] | None:
+        """The points on the cheapest way between two points, by Dijkstra's algorithm; None if there
+        is no way."""
         count = len(self.points)
         matrix = coo_array((self.costs, self.edges.T), shape=(count, count)).tocsr()
         _, before = dijkstra(matrix, directed=False, indices=first, return_predecessors=True)
@@ -55,7 +55,7 @@ class Graph:
             if before[way[-1]] < 0:
                 return None
             way.append(int(before[way[-1]]))
-        return self.points[way[::-1]]
+        return way[::-1]
 
 
 @dataclass(frozen=True)
@@ -109,19 +109,28 @@ def find_route(
     Raises:
         TsbenchError: the roadmap has no way from start to goal.
     """
-    points = halton(space.low, space.high, samples, seed)
-    points = np.concatenate([[space.start, space.goal], points[space.free(points, points)]])
-    graph = connected(space, points, neighbours)
-    corners = graph.quickest(0, 1)
-    if corners is None:
-        raise TsbenchError(
-            f"the roadmap of {samples} samples has no way to the goal: "
-            "more method.samples or method.neighbours are needed"
-        )
+    graph = connected(space, sampled(space, samples, seed), neighbours)
+    way = graph.quickest(0, 1)
+    if way is None:
+        raise no_way(samples)
+    corners = graph.points[way]
     if shortcut:
         corners = straightened(space, corners)
     steps = float(space.steps(corners[:-1], corners[1:]).sum())
     return Route(graph, corners, resampled(space, corners), steps)
+
+
+def sampled(space: RoadmapSpace[Any], samples: int, seed: int) -> np.ndarray:
+    """Start, goal and those Halton samples that are free, shape (n, d)."""
+    points = halton(space.low, space.high, samples, seed)
+    return np.concatenate([[space.start, space.goal], points[space.free(points, points)]])
+
+
+def no_way(samples: int) -> TsbenchError:
+    return TsbenchError(
+        f"the roadmap of {samples} samples has no way to the goal: "
+        "more method.samples or method.neighbours are needed"
+    )
 
 
 def connected(space: RoadmapSpace[Any], points: np.ndarray, neighbours: int) -> Graph:
@@ -157,7 +166,7 @@ def straightened(space: RoadmapSpace[Any], corners: np.ndarray) -> np.ndarray:
         graph = joined(space, points, pairs)
         found = graph.quickest(0, len(points) - 1)
         assert found is not None  # the way itself is in the graph
-        corners, before = found, cost
+        corners, before = points[found], cost
         cost = float(_costs(space, corners[:-1], corners[1:]).sum())
         if cost > before - 1e-6:
             break

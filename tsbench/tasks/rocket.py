@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -19,7 +19,7 @@ from tsbench.core.arrays import Array, array_namespace, like
 from tsbench.core.constants import constant
 from tsbench.core.drawing import Drawing, Flame
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
-from tsbench.core.roadmap import RoadmapSpace
+from tsbench.core.roadmap import DrivableSpace
 from tsbench.core.state import Course, Readings, Rng, Start, State
 from tsbench.core.task import Abstraction, Plannable, Tracker
 from tsbench.planning.path import Path, segment_distance
@@ -465,9 +465,11 @@ class RocketAbstraction(Abstraction[RocketState]):
         return RocketSpace(self.task)
 
 
-class RocketSpace(RoadmapSpace[RocketState]):
+class RocketSpace(DrivableSpace[RocketState]):
     """Positions in metres. The rocket stays upright: neither clearance nor reward depends on its
     angle."""
+
+    near = C.success_distance
 
     def __init__(self, task: Rocket) -> None:
         self.obstacles = np.array(task.obstacles).reshape(-1, 2)
@@ -489,6 +491,17 @@ class RocketSpace(RoadmapSpace[RocketState]):
 
     def places(self, points: np.ndarray) -> np.ndarray:
         return np.insert(points, 1, 0.0, axis=-1)
+
+    def points(self, state: RocketState) -> np.ndarray:
+        return np.asarray(state.position)
+
+    def sent(self, state: RocketState, points: np.ndarray) -> RocketState:
+        return state.replace(position=state.position + (self.goal - points))
+
+    def moved(self, start: Start, points: np.ndarray) -> Start:
+        qpos = start.qpos.copy()
+        qpos[:, :2] += points - self.start
+        return replace(start, qpos=qpos)
 
 
 class RocketTracker(Tracker[RocketState]):
