@@ -27,7 +27,7 @@ import numpy as np
 from tsbench.core.arrays import Array, array_namespace, step_of
 from tsbench.core.drawing import Drawing
 from tsbench.core.errors import TsbenchError, unknown
-from tsbench.core.motion import Audit, Plan, ReferenceMotion
+from tsbench.core.motion import Audit, Plan, ReferenceMotion, Roadmap
 from tsbench.core.roadmap import Lattice, RoadmapSpace
 from tsbench.core.state import Course, Readings, Rng, S, Start
 
@@ -385,17 +385,25 @@ class Plannable(Task[S]):
             raise unknown(f"imitation reward of {self.name}", form, self.imitation_forms)
         return form
 
+    def check_origin(self, made: Plan | ReferenceMotion | Roadmap) -> None:
+        """Checks that something was made for this task.
+
+        Raises:
+            TsbenchError: it was made for another task or version.
+        """
+        if (made.task, made.task_version) != (self.name, self.version):
+            raise TsbenchError(
+                f"the {made.kind} is for {made.task} version {made.task_version}, "
+                f"not for {self.name} version {self.version}"
+            )
+
     def check_fit(self, motion: Plan | ReferenceMotion) -> None:
         """Checks that a plan or reference motion belongs to this task.
 
         Raises:
             TsbenchError: the motion is for another task or version, or its arrays have other sizes.
         """
-        if (motion.task, motion.task_version) != (self.name, self.version):
-            raise TsbenchError(
-                f"the {motion.kind} is for {motion.task} version {motion.task_version}, "
-                f"not for {self.name} version {self.version}"
-            )
+        self.check_origin(motion)
         found: dict[str, tuple[int, ...]]
         wanted: dict[str, tuple[int, ...]]
         if isinstance(motion, Plan):

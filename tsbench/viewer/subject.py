@@ -11,7 +11,7 @@ import numpy as np
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError
-from tsbench.core.motion import Plan, ReferenceMotion, read_motion
+from tsbench.core.motion import Plan, ReferenceMotion, Roadmap, read_motion
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.evaluation.words import summary
@@ -34,6 +34,7 @@ class Subject:
         policy: what executes it, if there is one.
         reference: the plan as full poses, if there is one. One of the two there is.
         score: the content of `score.json`, if there is one.
+        roadmap: that the plan was made with, if there is one.
     """
 
     title: str
@@ -41,6 +42,7 @@ class Subject:
     policy: Policy | None
     reference: ReferenceMotion | None
     score: Record | None = None
+    roadmap: Roadmap | None = None
 
     def plan(self) -> Recording | None:
         return None if self.reference is None else record_motion(self.task, self.reference)
@@ -60,7 +62,8 @@ class Subject:
             if force is not None:
                 raise TsbenchError("only what a policy executes can be pushed, not a plan")
             assert plan is not None
-            return compose_plan(plan, title=self.title, verdict=planned_in_words(plan))
+            verdict = planned_in_words(plan)
+            return compose_plan(plan, title=self.title, verdict=verdict, roadmap=self.roadmap)
         recording = record_episode(self.task, self.policy, force)
         check_pushed(force, [recording])
         return self.show_of(recording, plan)
@@ -74,6 +77,7 @@ class Subject:
             title=self.title,
             verdict=" ".join([*sentences, executed_in_words(recording)]),
             summary=summary(self.score.score, self.task) if self.score else (),
+            roadmap=self.roadmap,
         )
 
 
@@ -113,6 +117,7 @@ def run_subject(run: RunDirectory) -> Subject:
         policy=policy,
         reference=run.reference(task),
         score=score,
+        roadmap=run.roadmap(task),
     )
 
 
@@ -122,12 +127,13 @@ def plan_subject(path: Path) -> Subject:
     Raises:
         TsbenchError: the file is neither, damaged, or for another version of its task.
     """
-    motion = read_motion(path)
-    task = plannable(RunDirectory(path.parent).task(motion.task))
+    motion, run = read_motion(path), RunDirectory(path.parent)
+    task = plannable(run.task(motion.task))
     task.check_fit(motion)
     if isinstance(motion, Plan):
         motion = task.reference(motion)
-    return Subject(f"{task.name}, {path.name}", task, None, motion)
+    title = f"{task.name}, {path.name}"
+    return Subject(title, task, None, motion, roadmap=run.roadmap(task))
 
 
 def pair(runs: Sequence[str], push: str | None = None) -> Show:
