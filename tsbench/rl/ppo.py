@@ -201,8 +201,8 @@ class Learner:
             self._update.learning_rate = rate
 
     def _credit(self, extras: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """What the steps that an arrival spares are credited with, as scores have it, in rewards
-        per step and discounted by actions."""
+        """The credit for the steps that an arrival spares, as in scores, in rewards per step and
+        discounted by actions."""
         s = self.settings
         spared, quality = extras["spared"] / s.repeat, extras["quality"]
         return self.environment.mdp.credit(spared, quality, s.discount**s.repeat)

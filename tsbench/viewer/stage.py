@@ -98,7 +98,7 @@ def _lines(spec: mujoco.MjSpec, name: str, lines: Lines) -> None:
         userface=(6 * np.arange(len(vertices))[:, None, None] + faces).ravel(),
         inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
-    spec.add_material(name=name, rgba=[*lines.colour, 1.0], emission=0.7, specular=0.0)
+    spec.add_material(name=name, rgba=[*lines.colour, 1.0], emission=0.4, specular=0.0)
     spec.worldbody.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_MESH,
