@@ -79,9 +79,9 @@ class Learner:
         self._update = make_update(self._actor, self._critic, storage, settings)
         if actor_from is not None:
             self._actor.load_state_dict(actor_from._actor.state_dict())
-            self._critic.obs_normalizer.load_state_dict(
-                actor_from._critic.obs_normalizer.state_dict()
-            )
+            seen = actor_from._critic.obs_normalizer
+            if seen.mean.shape == self._critic.obs_normalizer.mean.shape:  # the same disturbances
+                self._critic.obs_normalizer.load_state_dict(seen.state_dict())
             with torch.no_grad():
                 self._actor.distribution.log_std_param.fill_(math.log(settings.initial_std))
 
