@@ -64,8 +64,8 @@ class Options:
     """
 
     samples: int = 200
-    neighbours: int = 16
-    reach: float = 50.0
+    neighbours: int = 48
+    reach: float = 100.0
     rollouts: int = 20
     least: float = 0.7
     drive: float = 0.6
