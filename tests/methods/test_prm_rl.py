@@ -29,10 +29,9 @@ from tsbench.testing.contracts import Desk
 TRAINING = {"imitate": {"rollout": 8, "epochs": 1, "minibatches": 2, "hidden": [16]}}
 
 
-def problem(budget: int, audit: str = "warn", **options: Any) -> Problem:
+def problem(budget: int, **options: Any) -> Problem:
     task = tasks.make("rocket_navigation", distance=20.0)
-    act = Budget(192, budget, 8, audit=audit)
-    return Problem(task, act, TRAINING, options, seed=0, threads=1)
+    return Problem(task, Budget(192, budget, 8, audit="warn"), TRAINING, options, seed=0, threads=1)
 
 
 def space_of(task: Any) -> DrivableSpace[Any]:

@@ -253,7 +253,7 @@ def test_another_physics_is_played_beside_and_never_kept(
         "recovered, pushes": 2 * 4 * 2,
     }
     assert cli.main(["evaluate", "one", "--physics", "round"]) == 2
-    assert "unknown physics 'round'; allowed: elliptic, half_step" in capsys.readouterr().err
+    assert "unknown physics 'round'; allowed: elliptic, half_step, warp" in capsys.readouterr().err
     keep = ["evaluate", "one", "--protocol", quick, "--physics", "elliptic", "--keep", "board"]
     assert cli.main(keep) == 2
     assert "--keep copies scores by a protocol alone: leave out --ph" in capsys.readouterr().err

@@ -33,6 +33,9 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
+  device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
+  deterministic=true
+                   the same bits each time on a GPU, for more time
   resume=RUN       continues an interrupted run to the same result, bit for bit; takes no other
                    words
   method.KEY=...   an option of the method
@@ -279,7 +282,7 @@ def _evaluate(words: Sequence[str]) -> int:
         help="v1, or smoke, which takes seconds (the protocol of the run's score, else v1)",
     )
     help_physics = (
-        "elliptic or half_step: also play the protocol there and count the changed verdicts"
+        "elliptic, half_step or warp: also play the protocol there and count changed verdicts"
     )
     parser.add_argument("--physics", metavar="NAME", help=help_physics)
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
@@ -317,6 +320,7 @@ def _evaluate(words: Sequence[str]) -> int:
             parser.error("--keep copies scores by a protocol alone: leave out --physics")
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
+    engine = _engine(options.physics)
     console, standard = Console(), tasks.standard(task)
     with progress_bar(console, "evaluate") as progress:
         score = evaluate(
@@ -340,6 +344,7 @@ def _evaluate(words: Sequence[str]) -> int:
                 protocol=protocol.elsewhere(options.physics),
                 threads=options.threads,
                 progress=progress,
+                engine=engine,
             )
         flipped = flips(score, other)
         console.print(tables.flips_table(options.physics, flipped))
@@ -359,6 +364,21 @@ def _evaluate(words: Sequence[str]) -> int:
         directory.keep(run, options.keep, score)
         console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
     return 0
+
+
+def _engine(physics: str | None) -> Any:
+    """What plays a score in one of the other physics (`evaluation.protocol.PHYSICS`).
+
+    Raises:
+        TsbenchError: its packages are not installed.
+    """
+    if physics == "warp":
+        from tsbench.sim.warp import HostPhysics
+
+        return HostPhysics
+    from tsbench.sim.physics import Physics
+
+    return Physics
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
