@@ -13,6 +13,7 @@ from tsbench.core.method import Budget, Problem
 from tsbench.core.motion import Plan, ReferenceMotion, Roadmap
 from tsbench.core.task import plannable
 from tsbench.methods import prm
+from tsbench.runs.directory import RunDirectory
 from tsbench.sim.kinematic import naive_plan
 from tsbench.tasks.rocket import RocketAbstraction
 from tsbench.testing.contracts import Desk
@@ -38,6 +39,23 @@ def test_a_roadmap_is_planned_with_and_kept(tmp_path: Path) -> None:
     plan = Plan.load(tmp_path / "plan.npz")
     np.testing.assert_allclose(roadmap.path[-1, [0, 2]], plan.states[-1, :2])
     ReferenceMotion.load(tmp_path / "reference.npz")
+
+
+def test_a_run_has_its_roadmap(tmp_path: Path) -> None:
+    """It is one of the files that an entry keeps, and is checked like its plan."""
+    run, given = RunDirectory(tmp_path), problem("rocket_obstacles", samples=300)
+    assert run.roadmap(given.task) is None
+    prm.train(given, Desk(tmp_path))
+    assert run.roadmap_file in run.optional
+    assert run.roadmap(given.task) is not None
+    with pytest.raises(TsbenchError, match="the roadmap is for rocket_obstacles version 1, not"):
+        run.roadmap(tasks.make("rocket_navigation"))
+    run.roadmap_file.write_bytes(run.plan_file.read_bytes())
+    with pytest.raises(TsbenchError, match="is not a roadmap file"):
+        run.roadmap(given.task)
+    run.roadmap_file.write_bytes(b"nonsense")
+    with pytest.raises(TsbenchError, match="damaged roadmap file"):
+        run.roadmap(given.task)
 
 
 def test_options_change_the_plan(tmp_path: Path) -> None:
