@@ -128,6 +128,7 @@ def test_edges_that_cannot_be_driven_are_refused(tmp_path: Path) -> None:
     space.near = 1e3  # m: so that every start is there
     route = drivable_route(strict, desk, space, falling, stern, 20_000)
     assert " 0 of the way's " in desk.notes[0]
+    assert len(route.graph.edges) == route.graph.checked == len(route.corners) - 1
     np.testing.assert_array_equal(route.corners[[0, -1]], [space.start, space.goal])
 
 

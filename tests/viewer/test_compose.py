@@ -164,7 +164,7 @@ def test_a_roadmap_is_drawn_where_it_is() -> None:
     assert 0.0 < width[0] < width[1] < 0.05
     plain = compose(flies(0.7, 0.0), None, title="")
     assert "roadmap" not in {entry.name for entry in plain.legend}
-    assert plain.model.nmesh == 0
+    assert plain.model.nmesh == model.nmesh - 2
 
 
 def test_a_plan_alone(plan: Recording) -> None:

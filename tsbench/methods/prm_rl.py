@@ -31,7 +31,7 @@ from tsbench.core.roadmap import DrivableSpace
 from tsbench.core.state import Rng, S, Start
 from tsbench.core.task import Plant, SimulatedTask, Task, plannable, roadmap_space
 from tsbench.methods import options
-from tsbench.planning.roadmap import Route, connected, no_way, resampled, sampled
+from tsbench.planning.roadmap import Graph, Route, connected, no_way, resampled, sampled
 from tsbench.rl.distil import Lesson, distilled
 from tsbench.rl.stages import learn_physics, settings
 from tsbench.sim.episodes import PolicyFunction, play
@@ -175,7 +175,8 @@ def drivable_route(
     chosen: Options,
     budget: int,
 ) -> Route:
-    """The quickest way through a roadmap, of edges that the driver can drive.
+    """The quickest way through a roadmap, of edges that the driver can drive, and the graph of all
+    such edges that were found.
 
     Raises:
         TsbenchError: the roadmap has no way to the goal.
@@ -230,6 +231,8 @@ def drivable_route(
             "act more steps, or go on with method.audit=warn"
         )
     corners = graph.points[way]
+    proved = np.array([edge for edge, held in kept.items() if held], int)
+    graph = Graph(graph.points, graph.edges[proved], graph.costs[proved], len(kept))
     steps = float(space.steps(corners[:-1], corners[1:]).sum())
     return Route(graph, corners, resampled(space, corners), steps)
 
