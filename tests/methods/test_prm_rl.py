@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from tsbench import TsbenchError, tasks
 from tsbench.core.errors import PlanError
@@ -21,6 +22,8 @@ from tsbench.methods.prm_rl import Errands, Sent, always, drivable_route, next_c
 from tsbench.planning.roadmap import Graph, Route
 from tsbench.rl.distil import Lesson, distilled
 from tsbench.rl.settings import PPOSettings
+from tsbench.runs import config, execute
+from tsbench.runs.directory import RunDirectory
 from tsbench.sim.episodes import play
 from tsbench.sim.physics import Physics
 from tsbench.tasks.rocket import Rocket
@@ -154,6 +157,40 @@ def test_what_a_run_leaves(tmp_path: Path) -> None:
     assert sum(steps for _, steps in desk.stages) == 400
     assert len(Roadmap.load(tmp_path / "roadmap.npz").nodes) == 202
     assert (tmp_path / "plan.npz").exists()
+
+
+def test_an_interrupted_run_ends_with_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed while it distils, it drives the edges and distils again after it is resumed."""
+    words = [
+        "task=rocket_navigation", "method=prm_rl", "budget=smoke", "threads=1", "checkpoint=0",
+        "task.budgets.smoke.act=2000", "task.constants.distance=8.0", "method.rollouts=2",
+        "task.training.imitate.rollout=2", "task.training.imitate.minibatches=2",
+    ]  # fmt: skip
+
+    def run(directory: Path) -> RunDirectory:
+        chosen = replace(config.compose(words), directory=str(directory))
+        execute.execute(chosen, words, Console(quiet=True))
+        return RunDirectory(directory)
+
+    class Crash(BaseException):
+        """Nothing catches it."""
+
+    def crash(*_: Any) -> Any:
+        raise Crash
+
+    whole = run(tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        patch.setattr(prm_rl, "distilled", crash)
+        with pytest.raises(Crash):
+            run(tmp_path / "broken")
+    broken = RunDirectory(tmp_path / "broken")
+    execute.resume(broken.path, Console(quiet=True))
+    assert broken.policy().sha256 == whole.policy().sha256
+    stages = [[(stage.name, stage.steps) for stage in r.record().stages] for r in (whole, broken)]
+    assert stages[0] == stages[1]
+    assert [name for name, _ in stages[0]] == ["drive", "roadmap", "distil"]
 
 
 @pytest.mark.parametrize(
