@@ -25,6 +25,7 @@ from tsbench.core.roadmap import Lattice, RoadmapSpace
 LENGTH_COST = 1e-3
 BLOCK = 100_000  # edges that are checked together
 ROUNDS = 20  # of shortcutting, at most
+MOST_POINTS = 500  # of a way, besides its corners, that shortcuts may join
 CYCLES = 2  # that a layered roadmap looks ahead
 
 
@@ -155,13 +156,14 @@ def joined(space: RoadmapSpace[Any], points: np.ndarray, pairs: np.ndarray) -> G
 def straightened(space: RoadmapSpace[Any], corners: np.ndarray) -> np.ndarray:
     """The corners (k, d) of a way, with shortcuts.
 
-    The points of the way after each plan step, and its corners, are joined to all others that they
-    can move straight to, and the cheapest way through them is taken; again as long as that helps.
+    The points of the way after each plan step, or fewer on a long way, and its corners are joined
+    to all others that they can move straight to, and the cheapest way through them is taken; again as long as that helps.
     """
     cost = np.inf
     for _ in range(ROUNDS):
         times = _times(space, corners)
-        points = _along(corners, times, np.union1d(np.arange(times[-1]), times))
+        spacing = max(1.0, times[-1] / MOST_POINTS)
+        points = _along(corners, times, np.union1d(np.arange(0.0, times[-1], spacing), times))
         pairs = np.stack(np.triu_indices(len(points), 1), axis=-1)
         graph = joined(space, points, pairs)
         found = graph.quickest(0, len(points) - 1)
