@@ -11,7 +11,7 @@ set -u
 out=$1
 shift
 steps=${*:-versions check trot rocket bench obstacles walk}
-threads=$(nproc)
+threads=$(nproc --all)  # plain nproc heeds OMP_NUM_THREADS
 runs=$(mktemp -d)
 export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$PWD PYTHONUNBUFFERED=1 OMP_NUM_THREADS=1
 mkdir -p "$out"
