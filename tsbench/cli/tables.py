@@ -16,6 +16,7 @@ from tsbench.evaluation.flips import Flips
 from tsbench.evaluation.score import Score
 from tsbench.evaluation.words import FIGURES, counts, episode_rows, push_rows, verdict
 from tsbench.runs.directory import Record, RunDirectory
+from tsbench.viewer.paper import scores
 
 HEADLINES = ("solved_reward", "normalized_reward", "against_plan")
 
@@ -69,6 +70,18 @@ def show_run(console: Console, record: Record, task: Task[Any]) -> None:
         table.add_row(stage.name, f"{stage.steps:,}", duration(stage.seconds))
     console.print(table)
     show_rank(console, record.standard, record.score)
+
+
+def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
+    """Prints the scores of many runs: a table for each task, without the task's own measures."""
+    for task in dict.fromkeys(line.group.task for line in lines):
+        table = Table(title=task, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        for name in scores.COLUMNS[1:-1]:
+            table.add_column(name)
+        for line in lines:
+            if line.group.task == task:
+                table.add_row(*map(escape, scores.cells(line)[1:-1]))
+        console.print(table)
 
 
 def show_places(console: Console, run: RunDirectory) -> None:

@@ -160,7 +160,9 @@ class Learner:
                     "std": std,
                 }
                 if self._returns:
-                    metrics["episode_return"] = float(np.mean(self._returns))
+                    mdp, earned = self.environment.mdp, float(np.mean(self._returns))
+                    metrics["episode_return"] = earned
+                    metrics["normalized_return"] = earned / (mdp.max_reward * mdp.horizon)
                     metrics["episode_length"] = float(np.mean(self._lengths))
                 report(self.steps, metrics)
 
