@@ -77,10 +77,12 @@ def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
     for task in dict.fromkeys(line.group.task for line in lines):
         table = Table(title=task, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
         for name in scores.COLUMNS[1:-1]:
-            table.add_column(name)
+            table.add_column(name.replace("_", "\n"), overflow="fold")
         for line in lines:
             if line.group.task == task:
-                table.add_row(*map(escape, scores.cells(line)[1:-1]))
+                table.add_row(
+                    *(escape(one.replace(" [", "\n[")) for one in scores.cells(line)[1:-1])
+                )
         console.print(table)
 
 

@@ -206,22 +206,27 @@ def _parts(path: Path) -> Iterator[Results]:
         yield load(path)
     elif (run := RunDirectory(path)).begun:
         if (result := of_run(run)) is not None:
-            curves = {result.words: read_curves(run.metrics_file)}
-            yield Results({result.words: result}, curves, {result.words: run})
+            yield result
     else:
         for folder in sorted(one for one in path.iterdir() if one.is_dir()):
             yield from _parts(folder)
 
 
-def of_run(run: RunDirectory) -> Result | None:
-    """The result of a run or entry; None while it is unfinished.
+def of_run(run: RunDirectory) -> Results | None:
+    """The result of a run or entry alone; None while it is unfinished.
 
     Raises:
         TsbenchError: a file is missing or damaged.
     """
-    failure = ""
-    if not run.finished and not (failure := _failure(run)):
+    failure = "" if run.finished else _failure(run)
+    if not (run.finished or failure):
         return None
+    result = _result(run, failure)
+    curves = {result.words: read_curves(run.metrics_file)}
+    return Results({result.words: result}, curves, {result.words: run})
+
+
+def _result(run: RunDirectory, failure: str) -> Result:
     config, record = run.config(), run.record() if run.finished else None
     task = run.task(config.task.name)
     with os_errors(run.config_file):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -125,11 +126,21 @@ def grouped(groups: Sequence[Sequence[Result]]) -> list[Group]:
         one = rows[0]
         place = (one.task, one.method, one.distance)
         variant = seen[place] = seen.get(place, -1) + 1
-        same = [other[0] for other in groups if (other[0].task, other[0].method) == place[:2]]
-        several = len({(row.budget) for row in same if row.options == one.options}) > 1
-        label = _label(one) + (f", {one.budget}" if several else "")
+        label = _label(one)
+        if one.budget != _main_budget(groups, one):
+            label += f", budget {one.budget}"
         found.append(Group(tuple(rows), label, _paler(colours[one.method], variant)))
     return found
+
+
+def _main_budget(groups: Sequence[Sequence[Result]], one: Result) -> str:
+    """Of the budgets of a task, method and options the one with the most runs."""
+    counts: Counter[str] = Counter()
+    for rows in groups:
+        other = rows[0]
+        if (other.task, other.method, other.options) == (one.task, one.method, one.options):
+            counts[other.budget] += len(rows)
+    return counts.most_common(1)[0][0]
 
 
 def _label(result: Result) -> str:

@@ -44,7 +44,7 @@ def _exhibit(task: Plannable[Any], reference: ReferenceMotion, seed: int) -> Exh
         for name, form, values in zip(names, (None, *task.imitation_forms), maps, strict=True)
     }
     ratio = len(z) / len(x)
-    with drawing(0.4 + (0.35 + 4.9 * ratio) * len(maps)) as figure:
+    with drawing(0.4 + (0.35 + 4.5 * ratio) * len(maps)) as figure:
         panels = figure.subplots(len(maps), 1, sharex=True)
         for panel, name, values in zip(panels, names, maps, strict=True):
             image = panel.pcolormesh(

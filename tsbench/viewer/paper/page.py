@@ -93,6 +93,12 @@ def _remarks(
         if group not in rungs and group not in standard
     ]
     for group in groups:
+        protocols = {row.score.origin.protocol for row in group.rows if row.score}
+        found += [
+            f"{group.task}, {group.label}: protocol {protocol.name} asks too little for a rank"
+            for protocol in protocols
+            if not protocol.ranked
+        ]
         if len({row.settings for row in group.rows}) > 1:
             found.append(
                 f"{group.task}, {group.label}: its seeds were trained with several settings, "

@@ -169,16 +169,22 @@ def _draw_feet(panel: Any, task: Plannable[Any], one: Way) -> None:
 
 
 def _claims(task: str, ways: dict[Group, list[Way]]) -> Iterator[Claim]:
-    means = {
-        method: [one.roughness for group in ways for one in ways[group] if group.method == method]
+    plans = {
+        method: [one for group in ways for one in ways[group] if group.method == method]
         for method in (OURS, PRM)
     }
-    if not all(means.values()):
+    if not all(plans.values()):
         return
-    ours, theirs = (float(np.mean(values)) for values in means.values())
+    told, smoother = [], []
+    for name, unit in (("roughness", "m/s\u00b2"), ("turning", "rad/m")):
+        ours, theirs = (
+            float(np.mean([getattr(one, name) for one in members])) for members in plans.values()
+        )
+        told.append(f"{name} {ours:.2f} and {theirs:.2f} {unit}")
+        smoother.append(ours < theirs)
     yield Claim(
         "The learned plan is smoother than PRM's.",
-        f"{task}: the base accelerates by {ours:.1f} m/s\u00b2 in {OURS}'s plans and {theirs:.1f} "
-        f"in {PRM}'s ({len(means[OURS])} and {len(means[PRM])} plans)",
-        ours < theirs,
+        f"{task}: {' and '.join(told)}, of {len(plans[OURS])} plans of {OURS} and "
+        f"{len(plans[PRM])} of {PRM}",
+        smoother[0] if len(set(smoother)) == 1 else None,
     )

@@ -12,7 +12,6 @@ from tsbench.core.words import number
 from tsbench.evaluation.statistics import Aggregate, Difference, aggregate, holm
 from tsbench.viewer.paper.exhibit import (
     OURS,
-    Claim,
     Exhibit,
     Group,
     by_task,
@@ -145,14 +144,6 @@ def exhibit(groups: Sequence[Group], tasks: dict[str, Task]) -> tuple[Exhibit, l
             panel.set_xlim(left=min(0.0, panel.get_xlim()[0]))
             tidy(panel)
         panels[-1].set_xlabel("solved_reward")
-    claims = [
-        Claim(
-            "(not in the paper) A ranked row has at least ten seeds.",
-            f"{sum(one.solved.standing == 'ranked' for one in lines)} of {len(lines)} rows are "
-            "ranked, the others are dots without an interval",
-            None,
-        )
-    ]
     rows = [
         (
             row.task, group.label, row.seed, row.solved_reward, row.normalized_reward, row.success,
@@ -168,7 +159,7 @@ def exhibit(groups: Sequence[Group], tasks: dict[str, Task]) -> tuple[Exhibit, l
         note="A dot is a training seed, a diamond the interquartile mean over at least ten seeds, "
         "with its 95 % bootstrap interval. A seed whose plan fails its audit scores zero.",
         figure=figure,
-        claims=claims,
+        claims=(),
         columns=(
             "task", "method", "seed", "solved_reward", "normalized_reward", "success", "steps",
             "seconds", "trials", "failure", "command", "commit",
