@@ -193,11 +193,11 @@ def read(paths: Sequence[Path]) -> Results:
     for path in paths:
         if not path.is_dir():
             raise TsbenchError(f"no directory {path}")
-        before = len(found.rows)
-        for part in _parts(path):
-            found.update(part)
-        if len(found.rows) == before and not any(True for _ in _parts(path)):
+        parts = list(_parts(path))
+        if not parts:
             raise TsbenchError(f"{path} holds no finished run, no entry and no results")
+        for part in parts:
+            found.update(part)
     return found
 
 
@@ -352,8 +352,8 @@ def collect(new: Results, place: Path, trials: int | None = None) -> Results:
     Args:
         new: the results. Those in the folder with the same words are replaced.
         place: the folder.
-        trials: that were spent on tuning the settings of the new ones; None to leave them as they
-            are.
+        trials: that were spent on tuning the settings of the new ones; None for as many as the
+            folder says.
 
     Returns:
         All results that the folder has now.
@@ -362,9 +362,9 @@ def collect(new: Results, place: Path, trials: int | None = None) -> Results:
         TsbenchError: a file in the folder is damaged, or it cannot be written.
     """
     found = load(place) if (place / ROWS).exists() else Results()
-    if trials is not None:
-        rows = {words: replace(row, trials=trials) for words, row in new.rows.items()}
-        new = replace(new, rows=rows)
+    for words, row in new.rows.items():
+        before = found.rows.get(words, row).trials
+        new.rows[words] = replace(row, trials=before if trials is None else trials)
     found.update(new)
     with os_errors(place):
         place.mkdir(parents=True, exist_ok=True)
@@ -388,14 +388,20 @@ def _line(row: Result) -> bytes:
 
 
 def _keep_policies(found: Results, group: Sequence[Result], policies: Path) -> None:
-    """Keeps the policies of the best, the median and the worst run of those at hand, and removes
-    those that have been kept before and are none of these now. Changed tasks are for their scores
-    alone."""
+    """Keeps the policies of the best, the median and the worst run, or of those next to them whose
+    policies are at hand, and removes those that have been kept before and are none of these now.
+    Changed tasks are for their scores alone."""
     ranked = sorted(
-        (row for row in group if row.score and row.standard and row.words in found.folders),
+        (row for row in group if row.score and row.standard),
         key=lambda row: (row.solved_reward, row.normalized_reward),
     )
-    chosen = {ranked[i].words for i in (0, len(ranked) // 2, -1)} if ranked else set()
+    at_hand = [rank for rank, row in enumerate(ranked) if row.words in found.folders]
+    wanted = (0, len(ranked) // 2, len(ranked) - 1)
+    chosen = {
+        ranked[min(at_hand, key=lambda rank: abs(rank - place))].words
+        for place in wanted
+        if at_hand
+    }
     for row in group:
         folder, run = policies / _folder(row), found.folders.get(row.words)
         if row.words not in chosen:

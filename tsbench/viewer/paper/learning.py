@@ -132,7 +132,7 @@ def _exhibit(
     )
 
 
-def _stages(
+def points(
     axis: Axis, curves: Sequence[Curve], row: Result
 ) -> Iterator[tuple[Stage, np.ndarray, np.ndarray]]:
     """Each stage with the points of its curve, what earlier stages have cost added."""
@@ -151,7 +151,7 @@ def _means(
     SAMPLES)."""
     found: dict[str, list[tuple[Stage, np.ndarray, np.ndarray]]] = {}
     for row in rows:
-        for stage, x, y in _stages(axis, curves.get(row.words, ()), row):
+        for stage, x, y in points(axis, curves.get(row.words, ()), row):
             found.setdefault(stage.name, []).append((stage, x, y))
     for points in found.values():
         sampled = []
@@ -167,7 +167,7 @@ def _means(
 def _rows(
     axis: Axis, curves: Sequence[Curve], label: str, row: Result
 ) -> Iterator[tuple[object, ...]]:
-    for stage, xs, ys in _stages(axis, curves, row):
+    for stage, xs, ys in points(axis, curves, row):
         for x, y in zip(xs, ys, strict=True):
             yield row.task, label, row.seed, stage.name, round(float(x), 3), round(float(y), 6)
 
