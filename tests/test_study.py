@@ -28,14 +28,12 @@ def study(folder: Path, *lines: str, options: tuple[str, ...] = ()) -> tuple[int
 
 
 def test_a_study_keeps_each_run_and_does_none_twice(tmp_path: Path) -> None:
-    lines = (f"trials=3 {SMALL} seed=0,1  # two runs", f"{SMALL} seed=0 method.audit=stop")
+    lines = (f"trials=3 {SMALL} seed=0  # a run", f"{SMALL} seed=0 method.audit=stop")
     status, told, error = study(tmp_path, *lines)
     assert (status, error) == (0, "")
-    assert "[3 of 3]" in told
+    assert "[2 of 2]" in told
     rows = results.load(tmp_path / "kept").rows.values()
-    assert [(row.seed, row.trials, bool(row.failure)) for row in rows] == [
-        (0, 3, False), (0, 0, True), (1, 3, False),
-    ]  # fmt: skip
+    assert {(row.trials, bool(row.failure)) for row in rows} == {(3, False), (0, True)}
     assert study(tmp_path, *lines) == (0, "", "")
     # A run whose line is lost is collected again. A run of other code, unfinished, begins again.
     (tmp_path / "kept" / results.ROWS).unlink()
@@ -46,10 +44,10 @@ def test_a_study_keeps_each_run_and_does_none_twice(tmp_path: Path) -> None:
     write_json(run.versions_file, {**versions, "code": "other"})
     status, told, error = study(tmp_path, *lines)
     assert (status, error) == (0, "")
-    assert told.count("was there already") == 2
+    assert told.count("was there already") == 1
     assert "begins again" in told
     assert run.versions() == versions
-    assert len(results.load(tmp_path / "kept").rows) == 3
+    assert len(results.load(tmp_path / "kept").rows) == 2
 
 
 def test_a_mistake_in_a_study_is_told_before_anything_runs(tmp_path: Path) -> None:

@@ -153,14 +153,14 @@ def _means(
     for row in rows:
         for stage, x, y in points(axis, curves.get(row.words, ()), row):
             found.setdefault(stage.name, []).append((stage, x, y))
-    for points in found.values():
+    for seeds in found.values():
         sampled = []
-        for _, x, y in points:
+        for _, x, y in seeds:
             share = np.linspace(0.0, len(x) - 1.0, SAMPLES)
             at = np.arange(len(x))
             sampled.append((np.interp(share, at, x), np.interp(share, at, y)))
         xs, ys = np.array(sampled).transpose(1, 0, 2)
-        physics = any(stage.physics_substeps for stage, _, _ in points)
+        physics = any(stage.physics_substeps for stage, _, _ in seeds)
         yield ("-" if physics else PLANNING), xs, ys
 
 
