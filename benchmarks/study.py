@@ -227,17 +227,16 @@ def _interrupt(*_: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def main() -> int:
-    if sys.argv[1:2] == [WORK]:
-        return train(sys.argv[2:])
+def main(arguments: Sequence[str]) -> int:
+    if arguments[:1] == [WORK]:
+        return train(arguments[1:])
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("study", type=Path, metavar="FILE", help="a sweep in each line")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="results folder")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="side by side (all cores)")
     parser.add_argument("--hours", type=float, help="stop after so many")
     parser.add_argument("--list", action="store_true", help="name what is left to do, and stop")
-    options = parser.parse_args()
-    signal.signal(signal.SIGTERM, _interrupt)
+    options = parser.parse_args(arguments)
     try:
         study = Study(read_jobs(options.study), options.out)
         if options.list:
@@ -256,4 +255,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    signal.signal(signal.SIGTERM, _interrupt)
+    sys.exit(main(sys.argv[1:]))

@@ -73,16 +73,17 @@ def show_run(console: Console, record: Record, task: Task[Any]) -> None:
 
 
 def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
-    """Prints the scores of many runs: a table for each task, without the task's own measures."""
+    """Prints the scores of many runs: a table for each task, a column for each method."""
     for task in dict.fromkeys(line.group.task for line in lines):
+        own = [line for line in lines if line.group.task == task]
         table = Table(title=task, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-        for name in scores.COLUMNS[1:-1]:
-            table.add_column(name.replace("_", "\n"), overflow="fold")
-        for line in lines:
-            if line.group.task == task:
-                table.add_row(
-                    *(escape(one.replace(" [", "\n[")) for one in scores.cells(line)[1:-1])
-                )
+        for header in ("", *(line.group.label for line in own)):
+            table.add_column(escape(header), overflow="fold")
+        columns = [scores.cells(line) for line in own]
+        for row in zip(scores.COLUMNS[2:-1], *(one[2:-1] for one in columns), strict=True):
+            table.add_row(*(escape(one.replace(" [", "\n[")) for one in row))
+        for name in own[0].measures:
+            table.add_row(name, *(number(line.measures[name]) for line in own))
         console.print(table)
 
 
