@@ -22,7 +22,7 @@ from tsbench.rl.settings import PPOSettings
 from tsbench.rl.stages import StageSettings, learn_planning, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment
-from tsbench.sim.disturbed import Disturbances
+from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.episodes import play
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.physics import Physics
@@ -217,6 +217,18 @@ def test_going_on_with_another_reward() -> None:
     assert bits(second.policy(task, "test")) != bits(first.policy(task, "test"))
 
 
+def test_going_on_under_other_disturbances() -> None:
+    """A critic that is told of more or less than the one before learns its normaliser anew."""
+    task = tasks.make("rocket_navigation", distance=3.0)
+    first = learner(subject=task)
+    first.learn(128)
+    physics = DisturbedPhysics(task, 8, Disturbances(latency=1), 0, threads=1)
+    second = Learner(BatchedEnvironment(task, physics, 8, 0), TINY, 0, first)
+    assert bits(second.policy(task, "test")) == bits(first.policy(task, "test"))
+    second.learn(128)
+    assert second.steps == 128
+
+
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_artefact_is_the_actor(encoding: str) -> None:
     taught = learner(replace(TINY, encoding=encoding))
@@ -224,7 +236,7 @@ def test_the_artefact_is_the_actor(encoding: str) -> None:
     policy = taught.policy(tasks.make("rocket_navigation", distance=3.0), "test")
     assert policy.info.layers == (7, 16, 3)
     assert (policy.info.task, policy.info.method) == ("rocket_navigation", "test")
-    environment = TorchEnvironment(taught.environment, encoding)
+    environment = TorchEnvironment(cast(Any, taught.environment), encoding)
     actor = taught._actor
     actor.eval()
     with torch.inference_mode():
@@ -348,7 +360,7 @@ def test_a_learner_is_told_of_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
         returns += running[dones == 1].tolist()
         running[dones == 1] = 0.0
     assert arrivals > 8
-    np.testing.assert_allclose(list(taught._returns), returns[-100:], rtol=1e-5)
+    np.testing.assert_allclose(list(cast(Any, taught._env)._returns), returns[-100:], rtol=1e-5)
 
 
 # Settings

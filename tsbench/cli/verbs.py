@@ -23,22 +23,26 @@ from tsbench.gl import find_working_backend
 RUN_HELP = """\
 usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
 
-Trains a policy, evaluates it on the original task and leaves a run directory that explains itself.
+Trains a policy, evaluates it on the task and writes a run directory with a report.
 
 words, in Hydra's grammar:
-  task=NAME        what to solve; `tsbench list` names them
-  method=NAME      what solves it (twostage)
+  task=NAME        the task; `tsbench list` names all
+  method=NAME      the method (twostage)
   budget=NAME      smoke: seconds, fast: the standard, paper: the published one (fast)
-  seed=N           everything random comes from it (0)
+  seed=N           the seed of all random numbers (0)
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
-  resume=RUN       goes on with an interrupted run, to the same bits; alone, without other words
+  device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
+  deterministic=true
+                   the same bits each time on a GPU, for more time
+  resume=RUN       continues an interrupted run to the same result, bit for bit; takes no other
+                   words
   method.KEY=...   an option of the method
   task.training.STAGE.KEY=...
                    a PPO setting of the plan, imitate, finetune or task stages
   task.constants.KEY=...
-                   a constant of the task, for studies: such a score cannot be ranked
+                   a constant of the task, for studies: such a score is not ranked
 
 options:
   --cfg job        show the configuration and stop
@@ -272,17 +276,25 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="POLICY_OR_RUN",
         help="directory with a policy in it, .onnx file, stable-baselines3 .zip, zero or random",
     )
-    parser.add_argument("task", nargs="?", metavar="task=NAME", help="where the policy says none")
+    parser.add_argument(
+        "task", nargs="?", metavar="task=NAME", help="for a policy that names no task"
+    )
     parser.add_argument(
         "--protocol",
         metavar="NAME",
-        help="v1 or smoke, which takes seconds (as the run was scored, else v1)",
+        help="v1, or smoke, which takes seconds (the protocol of the run's score, else v1)",
     )
-    help_physics = "elliptic or half_step: play it there too, and count the verdicts that flip"
+    help_physics = (
+        "elliptic, half_step or warp: also play the protocol there and count changed verdicts"
+    )
     parser.add_argument("--physics", metavar="NAME", help=help_physics)
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
-    parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
-    help_keep = "copy a finished run and this score into a new directory, as leaderboards/ has it"
+    parser.add_argument(
+        "--trust-sb3",
+        metavar="ALGORITHM",
+        help="the algorithm that saved the .zip, which can run any code when it is loaded",
+    )
+    help_keep = "copy a finished run and this score into a new directory, as in leaderboards/"
     parser.add_argument("--keep", type=Path, metavar="DIRECTORY", help=help_keep)
     options = parser.parse_args(words)
     from tsbench import tasks
@@ -308,9 +320,10 @@ def _evaluate(words: Sequence[str]) -> int:
     if options.keep is not None:
         directory.check_keep(run, options.keep, protocol)
         if options.physics is not None:
-            parser.error("--keep keeps certified scores: leave out --physics")
+            parser.error("--keep copies scores by a protocol alone: leave out --physics")
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
+    engine = _engine(options.physics)
     console, standard = Console(), tasks.standard(task)
     with progress_bar(console, "evaluate") as progress:
         score = evaluate(
@@ -334,12 +347,13 @@ def _evaluate(words: Sequence[str]) -> int:
                 protocol=protocol.elsewhere(options.physics),
                 threads=options.threads,
                 progress=progress,
+                engine=engine,
             )
         flipped = flips(score, other)
         console.print(tables.flips_table(options.physics, flipped))
         console.print(
-            f" solved_reward {number(other.solved_reward)} in physics {options.physics}, "
-            f"{number(score.solved_reward)} certified; the first is never ranked or kept",
+            f" solved_reward: {number(score.solved_reward)} by protocol {protocol.name}, "
+            f"{number(other.solved_reward)} in physics {options.physics}, which is never ranked",
             highlight=False,
             soft_wrap=True,
         )
@@ -353,6 +367,21 @@ def _evaluate(words: Sequence[str]) -> int:
         directory.keep(run, options.keep, score)
         console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
     return 0
+
+
+def _engine(physics: str | None) -> Any:
+    """What plays a score in one of the other physics (`evaluation.protocol.PHYSICS`).
+
+    Raises:
+        TsbenchError: its packages are not installed.
+    """
+    if physics == "warp":
+        from tsbench.sim.warp import HostPhysics
+
+        return HostPhysics
+    from tsbench.sim.physics import Physics
+
+    return Physics
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
@@ -459,7 +488,7 @@ def _port(word: str) -> int:
 def _report(words: Sequence[str]) -> None:
     parser = _parser("report", json=False)
     parser.add_argument("run", type=Path, metavar="RUN", help="a finished run's directory")
-    what = "the page to write, a new one (what RUN lacks of its report.html and view.html)"
+    what = "the new page (the missing ones of report.html and view.html in RUN)"
     parser.add_argument("--html", type=Path, metavar="FILE", help=what)
     options = parser.parse_args(words)
     from tsbench.core.files import check_new, write_new
@@ -519,7 +548,7 @@ def _figures(words: Sequence[str]) -> None:
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
     parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
-    parser.add_argument("--quick", action="store_true", help="a minute, with larger ranges")
+    parser.add_argument("--quick", action="store_true", help="a minute, with wider ranges")
     options = parser.parse_args(words)
     from tsbench import bench
     from tsbench.bench import table
@@ -535,11 +564,11 @@ def _bench(words: Sequence[str]) -> None:
 
 VERBS = {
     "run": Verb("train a policy and evaluate it", _run),
-    "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
-    "view": Verb("see a run, a plan or a task move: live, as a page or as a video", _view),
-    "report": Verb("write one page about a run: what was planned, done and learned", _report),
+    "evaluate": Verb("score a policy by a protocol", _evaluate),
+    "view": Verb("show a run, a plan or a task in motion: live, as a page or as a video", _view),
+    "report": Verb("write one page about a run: plan, motion, score and learning", _report),
     "collect": Verb("keep the scores, curves and best policies of many runs as data", _collect),
     "figures": Verb("make the paper's figures and its table again, from runs or results", _figures),
-    "bench": Verb("measure how fast it is, side by side with others", _bench),
+    "bench": Verb("measure speed, beside alternatives", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }

@@ -145,8 +145,10 @@ def _main_budget(groups: Sequence[Sequence[Result]], one: Result) -> str:
 
 def _label(result: Result) -> str:
     """The method with its options; that it has settings of its own is all that is said of them."""
-    options = [word.partition(".")[2] for word in result.options if word.startswith("method.")]
-    others = any(not word.startswith("method.") for word in result.options)
+    options = [
+        word.removeprefix("method.") for word in result.options if not word.startswith("task.")
+    ]
+    others = any(word.startswith("task.") for word in result.options)
     tuned = ["tuned" if result.trials else "other settings"] if others else []
     return ", ".join([result.method, *options, *tuned])
 
