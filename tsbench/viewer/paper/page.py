@@ -52,7 +52,7 @@ def write(results: Results, out: Path) -> tuple[list[scores.Line], list[str]]:
         first, lines = scores.exhibit(standard, made)
         exhibits.append(first)
     exhibits += maps.exhibits(results, standard)
-    exhibits += learning.exhibits(results, standard)
+    exhibits += learning.exhibits(results, standard, made)
     exhibits += plans.exhibits(results, standard, made)
     try:
         exhibits += strips.exhibits(results, standard, made)

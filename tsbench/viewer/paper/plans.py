@@ -21,6 +21,7 @@ from tsbench.viewer.paper.exhibit import (
     drawing,
     tidy,
 )
+from tsbench.viewer.recording import record_motion
 from tsbench.viewer.scene import Array
 from tsbench.viewer.show import Actor, track
 
@@ -126,7 +127,7 @@ def _exhibit(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Exhibit:
         note=f"{what} Smoothness of the base's path until it arrives, mean over seeds: the root of "
         "the mean squared acceleration, and by how much the direction turns in a metre.",
         figure=figure,
-        claims=tuple(_claims(task.name, ways)),
+        claims=tuple(_claims(task, ways)),
         columns=(
             "task", "method", "seed", "length_m", "seconds", "roughness_m_per_s2",
             "turning_rad_per_m",
@@ -168,7 +169,33 @@ def _draw_feet(panel: Any, task: Plannable[Any], one: Way) -> None:
     panel.legend(ncols=4, loc="upper left", fontsize=9)
 
 
-def _claims(task: str, ways: dict[Group, list[Way]]) -> Iterator[Claim]:
+def _claims(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Claim]:
+    """Of a planar task how smooth its plans are, of one with feet how regular its footsteps."""
+    if task.drawing().bounds is None:
+        yield from _regular(task, ways)
+    else:
+        yield from _smoother(task.name, ways)
+
+
+def _regular(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Claim]:
+    """By the task's leading measure, of the first plan of each group."""
+    measure = next(iter(task.measure_notes))
+    found = {
+        group: record_motion(task, task.reference(members[0].plan)).measures[measure]
+        for group, members in ways.items()
+    }
+    ours = next((value for group, value in found.items() if group.method == OURS), None)
+    for group, value in found.items():
+        if group.method == PRM and value is not None and ours is not None:
+            yield Claim(
+                "PRM's plans have irregular footsteps.",
+                f"{task.name}: {measure} {value:.2f} in {group.label}'s plan, {ours:.2f} in the "
+                "learned one",
+                value < ours,
+            )
+
+
+def _smoother(task: str, ways: dict[Group, list[Way]]) -> Iterator[Claim]:
     plans = {
         method: [one for group in ways for one in ways[group] if group.method == method]
         for method in (OURS, PRM)
