@@ -90,7 +90,7 @@ class Group:
     Attributes:
         rows: by seed.
         label: names the group among those of its task.
-        colour: of its method; paler for further variants of the method.
+        colour: of its method; paler or darker for further variants of the method.
     """
 
     rows: tuple[Result, ...]
@@ -129,7 +129,7 @@ def grouped(groups: Sequence[Sequence[Result]]) -> list[Group]:
         label = _label(one)
         if one.budget != _main_budget(groups, one):
             label += f", budget {one.budget}"
-        found.append(Group(tuple(rows), label, _paler(colours[one.method], variant)))
+        found.append(Group(tuple(rows), label, _shade(colours[one.method], variant)))
     return found
 
 
@@ -153,10 +153,12 @@ def _label(result: Result) -> str:
     return ", ".join([result.method, *options, *tuned])
 
 
-def _paler(colour: str, times: int) -> str:
-    share = 0.6**times
-    paler: str = to_hex([1.0 - share * (1.0 - part) for part in to_rgb(colour)])
-    return paler
+def _shade(colour: str, variant: int) -> str:
+    """The colour, then paler, darker, still paler, still darker ones."""
+    share = 0.6 ** ((variant + 1) // 2)
+    ground = variant % 2  # white or black
+    mixed: str = to_hex([ground + share * (part - ground) for part in to_rgb(colour)])
+    return mixed
 
 
 @contextmanager

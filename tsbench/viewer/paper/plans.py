@@ -178,20 +178,26 @@ def _claims(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Clai
 
 
 def _regular(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Claim]:
-    """By the task's leading measure, of the first plan of each group."""
+    """By the task's leading measure and by the audit, of the first plan of each group."""
     measure = next(iter(task.measure_notes))
-    found = {
-        group: record_motion(task, task.reference(members[0].plan)).measures[measure]
-        for group, members in ways.items()
-    }
-    ours = next((value for group, value in found.items() if group.method == OURS), None)
-    for group, value in found.items():
-        if group.method == PRM and value is not None and ours is not None:
+    values: dict[Group, float] = {}
+    failures: dict[Group, str] = {}
+    for group, members in ways.items():
+        reference = task.reference(members[0].plan)
+        values[group] = record_motion(task, reference).measures[measure] or 0.0
+        failed = task.audit(members[0].plan, reference).failures
+        failures[group] = ", ".join(item.what for item in failed)
+    ours = next((value for group, value in values.items() if group.method == OURS), None)
+    for group, value in values.items():
+        if group.method == PRM and ours is not None:
+            audit = (
+                f"fails its audit ({failures[group]})" if failures[group] else "passes its audit"
+            )
             yield Claim(
                 "PRM's plans have irregular footsteps.",
-                f"{task.name}: {measure} {value:.2f} in {group.label}'s plan, {ours:.2f} in the "
-                "learned one",
-                value < ours,
+                f"{task.name}: the plan of {group.label} {audit}; {measure} {value:.2f}, of the "
+                f"learned plan {ours:.2f}",
+                bool(failures[group]) or value < ours,
             )
 
 

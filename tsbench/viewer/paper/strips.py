@@ -39,14 +39,22 @@ def exhibits(
         if not tasks[name].drawing().feet:
             continue
         cast: dict[Group, tuple[Result, Recording]] = {}
-        for group in members:
-            rows = [row for row in group.rows if row.words in results.folders and row.score]
-            if rows and group.method not in {other.method for other in cast}:
-                best = max(rows, key=lambda row: row.normalized_reward)
+        for method in dict.fromkeys(group.method for group in members):
+            shown = [
+                group for group in members if group.method == method and _at_hand(results, group)
+            ]
+            if shown:
+                group = max(shown, key=lambda group: len(group.rows))
+                best = max(_at_hand(results, group), key=lambda row: row.normalized_reward)
                 policy = results.folders[best.words].policy()
                 cast[group] = (best, record_episode(tasks[name], policy))
         if cast:
             yield _exhibit(tasks[name], cast)
+
+
+def _at_hand(results: Results, group: Group) -> list[Result]:
+    """The group's results whose policies are at hand."""
+    return [row for row in group.rows if row.words in results.folders and row.score]
 
 
 def _exhibit(task: Task, cast: dict[Group, tuple[Result, Recording]]) -> Exhibit:

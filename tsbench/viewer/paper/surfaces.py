@@ -94,7 +94,7 @@ def _exhibit(task: Task, scored: dict[Group, list[tuple[Result, Surface]]]) -> E
         f"{task.mishap} and without straying. Recovered: it was solved too. Above: thin lines are "
         "seeds, thick ones their mean. Below: share of the seeds' pushes that are survived.",
         figure=figure,
-        claims=tuple(_claims(scored)),
+        claims=tuple(_claims(scored)) if task.drawing().feet else (),
         columns=("task", "method", "force_N", "heading_rad", "phase_step", "seeds", *KINDS),
         rows=rows,
     )
