@@ -162,7 +162,11 @@ class Study:
         said = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
         command = [sys.executable, __file__, WORK, *job.given]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        process = subprocess.Popen(command, stdout=said, stderr=said, env=environment)
+        # In a session of its own: of two signals, the terminal's Ctrl-C and that of `stop`, the
+        # second would end a training before its state is saved.
+        process = subprocess.Popen(
+            command, stdout=said, stderr=said, env=environment, start_new_session=True
+        )
         self.running.append(Training(job, process, said, time.monotonic()))
 
     def _finish(self, training: Training) -> None:
