@@ -15,6 +15,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from tsbench.core.words import several
 from tsbench.evaluation.statistics import Difference, paired_difference
 from tsbench.runs.results import Result
 
@@ -211,7 +212,7 @@ def compare(
     found = difference(first, second, "normalized_reward")
     means = " and ".join(
         f"{group.label} {np.mean(list(group.values('normalized_reward').values())):.3f} "
-        f"({len(group.rows)} seeds)"
+        f"({several(len(group.rows), 'seed')})"
         for group in (first, second)
     )
     text = f"{task}: normalized reward {means}"

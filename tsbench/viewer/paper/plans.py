@@ -10,6 +10,7 @@ import numpy as np
 
 from tsbench.core.motion import Plan
 from tsbench.core.task import Plannable, Task
+from tsbench.core.words import several
 from tsbench.runs.results import Results
 from tsbench.viewer.paper.exhibit import (
     OURS,
@@ -217,7 +218,7 @@ def _smoother(task: str, ways: dict[Group, list[Way]]) -> Iterator[Claim]:
         smoother.append(ours < theirs)
     yield Claim(
         "The learned plan is smoother than PRM's.",
-        f"{task}: {' and '.join(told)}, of {len(plans[OURS])} plans of {OURS} and "
-        f"{len(plans[PRM])} of {PRM}",
+        f"{task}: {' and '.join(told)}, of {several(len(plans[OURS]), 'plan')} of {OURS} "
+        f"and {len(plans[PRM])} of {PRM}",
         smoother[0] if len(set(smoother)) == 1 else None,
     )
