@@ -30,11 +30,11 @@ from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.flips import flips
 from tsbench.evaluation.protocol import V1
 from tsbench.runs.directory import RunDirectory
+from tsbench.sim.agreement import disagreements, one_step_gaps, whole_episode_gaps
 from tsbench.sim.change import Change
 from tsbench.sim.device import DeviceEnvironment
 from tsbench.sim.disturbed import Disturbances
 from tsbench.sim.warp import HostPhysics, WarpPhysics
-from tsbench.testing.engines import disagreements, one_step_gaps, whole_episode_gaps
 
 ROOT = Path(__file__).parents[1]
 MODELS = ("laikago_trot", "rocket_navigation", "rocket_obstacles")  # the walk's is the trot's
@@ -108,7 +108,11 @@ class Checks:
         started = time.perf_counter()
         others = {name: subprocess.Popen([*command, name]) for name in MODELS}
         for name, process in others.items():
-            code = process.wait()
+            try:
+                code: object = process.wait(timeout=max(1.0, 200.0 + started - time.perf_counter()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                code = "killed"
             say(f"compiled {name}: status {code}, {time.perf_counter() - started:.0f} s")
 
     def made(self, name: str, count: int, **more: Any) -> WarpPhysics[Any]:
@@ -195,7 +199,7 @@ class Checks:
 
         advanced = self.rate(advance, count)
         environment: DeviceEnvironment[Any] = DeviceEnvironment(
-            physics.task, physics, count, 0, self.device
+            physics.task, physics, count, 0, physics.device
         )
         environment.reset()
         whole = self.rate(lambda: environment.step(action), count)

@@ -4,14 +4,14 @@
 #
 #   bash benchmarks/on_gpu.sh OUT [STEP ...]      with tsbench's packages on the path
 #
-# OUT gets log.txt, bench.json and runs.tgz. The steps, in the order of the default:
+# OUT gets log.txt, bench.json and each training's directory as STEP.tgz. The steps, in the order of the default:
 #   versions check trot rocket bench obstacles walk
 # and physics, which is not among them.
 set -u
 out=$1
 shift
 steps=${*:-versions check trot rocket bench obstacles walk}
-threads=$(nproc)
+threads=$(nproc --all)  # plain nproc heeds OMP_NUM_THREADS
 runs=$(mktemp -d)
 export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$PWD PYTHONUNBUFFERED=1 OMP_NUM_THREADS=1
 mkdir -p "$out"
@@ -26,7 +26,7 @@ run() { # NAME SECONDS COMMAND...
 train() { # NAME SECONDS WORDS...
     run "$1" "$2" python3 -m tsbench run "${@:3}" device=cuda threads="$threads" \
         ++task.budgets.fast.audit=warn directory="$runs/$1"
-    tar -czf "$out/runs.tgz" -C "$runs" .
+    tar -czf "$out/$1.tgz" -C "$runs" "$1"
 }
 
 for step in $steps; do

@@ -48,6 +48,7 @@ ONLY_IN: dict[str, set[str]] = {
     "dm_env": {"sim", "testing"},
     "mujoco": {"core.task", "planning", "sim", "tasks", "viewer", "bench", "cli.verbs"},
     "safetensors": {"core.policy", "runs.checkpoint"},
+    "optuna": {"runs.tune"},
     "hydra": {"runs.config", "cli.launch"},
     "omegaconf": {"runs.config", "cli.launch"},
     "meshcat": {"viewer"},

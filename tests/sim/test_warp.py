@@ -20,16 +20,16 @@ from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.flips import flips
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.robustness import mass_scale
-from tsbench.sim.change import Change
-from tsbench.sim.disturbed import Disturbances
-from tsbench.sim.physics import Physics
-from tsbench.sim.push import Push
-from tsbench.testing.engines import (
+from tsbench.sim.agreement import (
     Gaps,
     disagreements,
     one_step_gaps,
     whole_episode_gaps,
 )
+from tsbench.sim.change import Change
+from tsbench.sim.disturbed import Disturbances
+from tsbench.sim.physics import Physics
+from tsbench.sim.push import Push
 from tsbench.testing.episodes import one_of_each_kind
 
 pytest.importorskip("mujoco_warp", reason="needs the extra: tsbench[gpu]")

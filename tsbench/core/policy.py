@@ -133,7 +133,11 @@ class Policy:
 
         Raises:
             OSError: a file cannot be written.
+            TsbenchError: an array is not of type float32, so `load` would refuse it.
         """
+        for array in (self.mean, self.scale, *self.weights, *self.biases):
+            if array.dtype != np.float32:
+                raise TsbenchError(f"the arrays of a policy are float32, not {array.dtype}")
         directory = Path(directory)
         content = self._content()
         info = asdict(self.info) | {"sha256": hashlib.sha256(content).hexdigest()}

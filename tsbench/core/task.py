@@ -152,9 +152,10 @@ class Plant(ABC, Generic[S]):
         """The model, with goal and obstacles in it. The viewer frames and labels what is named
         `goal` (a site) and `obstacle_1`, `obstacle_2`, ... (spheres)."""
 
-    @abstractmethod
     def control(self, state: S, action: Array) -> tuple[Array, Array]:
-        """Actuator controls (..., nu) for an action, and the memory (..., m) for the next state."""
+        """Actuator controls (..., nu) for an action, and the memory (..., m) for the next state. By
+        default the controls are the clipped action, and the memory stays as it is."""
+        return array_namespace(action).clip(action, -1.0, 1.0), self.memory(state)
 
     @abstractmethod
     def read(self, readings: Readings) -> S:

@@ -168,7 +168,16 @@ def compose(words: Sequence[str]) -> RunConfig:
             node = hydra_compose("config", overrides=opened(words))
     except ValueError as error:  # Hydra raises it where the value of a group is not a name
         raise TsbenchError(f"{_flat(error)} (in: {' '.join(words)})") from None
-    return parse(node, keys(words))
+    config = parse(node, keys(words))
+    files = {override.key_or_group: override.value() for override in overrides}
+    for group, name in (("task", config.task.name), ("method", config.method["name"])):
+        _check_name(group, files.get(group, name), name)
+    return config
+
+
+def _check_name(group: str, file: str, name: str) -> None:
+    if name != file:
+        raise TsbenchError(f"conf/{group}/{file}.yaml must have name: {file}, not {name}")
 
 
 def parse(node: DictConfig, given: Collection[str]) -> RunConfig:
@@ -247,6 +256,21 @@ def names(group: str) -> tuple[str, ...]:
     return tuple(sorted(_files(group)))
 
 
+def incomplete() -> tuple[str, ...]:
+    """A line for each task and method that can be made but not run, since it has no configuration
+    of its name."""
+    return tuple(
+        _lacking(group, name)
+        for group, registry in (("task", tasks), ("method", methods))
+        for name in registry.names()
+        if name not in _files(group)
+    )
+
+
+def _lacking(group: str, name: str) -> str:
+    return f"the {group} {name!r} cannot be run: its package lacks conf/{group}/{name}.yaml"
+
+
 def budgets(task: str) -> dict[str, Budget]:
     """The budgets that a task's configuration offers; none without a configuration.
 
@@ -259,6 +283,7 @@ def budgets(task: str) -> dict[str, Budget]:
     with one_line_errors():
         plain = OmegaConf.to_container(OmegaConf.create(file.read_text("utf-8")), resolve=True)
     config: TaskConfig = typed(TaskConfig, plain, "task")
+    _check_name("task", task, config.name)
     return config.budgets
 
 
@@ -287,9 +312,7 @@ def one_line_errors() -> Iterator[None]:
         parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
         registry = {"task": tasks, "method": methods}.get(parts[0])
         if registry is not None and parts[2] in registry.names():
-            raise TsbenchError(
-                f"the {parts[0]} {parts[2]!r} cannot be run: its package lacks conf/{missing}.yaml"
-            ) from None
+            raise TsbenchError(_lacking(parts[0], parts[2])) from None
         raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__

@@ -30,8 +30,9 @@ from tsbench.core.errors import (
 )
 from tsbench.core.files import PART, taken, write_json, write_whole
 from tsbench.core.method import Problem
+from tsbench.core.policy import Policy
 from tsbench.core.typed import unknown_key
-from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
 from tsbench.rl import processes
@@ -52,7 +53,7 @@ def prepare(config: RunConfig) -> Problem:
         TsbenchError: unknown names, or values of the wrong type.
     """
     problem = Problem(
-        task=tasks.make(config.task.name, **config.task.constants),
+        task=tasks.checked(config.task.name, **config.task.constants),
         budget=config.task.budgets[config.budget],
         training=config.task.training,
         options=config.method,
@@ -251,8 +252,14 @@ def _train(
     config: RunConfig, problem: Problem, workspace: RunWorkspace, console: Console
 ) -> Record:
     run = RunDirectory(workspace.directory)
+    name = config.method["name"]
     with processes.together(torch_device(problem.device)):
-        policy = methods.find(config.method["name"]).train(problem, workspace)
+        # A plug-in may return anything.
+        policy: object = methods.find(name).train(problem, workspace)
+    if not isinstance(policy, Policy):
+        given = type(policy).__name__
+        raise TsbenchError(f"the method {name} returns {given}, not a Policy")
+    check_fit(policy, problem.task)
     policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
     with progress_bar(console, "evaluate") as progress:
@@ -265,7 +272,7 @@ def _train(
         task=problem.task.name,
         task_version=problem.task.version,
         standard=tasks.standard(problem.task),
-        method=config.method["name"],
+        method=name,
         seed=config.seed,
         budget=config.budget,
         score=score,

@@ -22,26 +22,14 @@ class TestLazy(MethodContract):
     task = "cart"
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
 import pytest
 
-if TYPE_CHECKING:
-    from tsbench.testing.arrays import ArrayContract
-    from tsbench.testing.contracts import MethodContract, PlanningContract, TaskContract
-
-# It must come before their imports, or failing assertions do not show their values.
+# It must come before the imports, or failing assertions do not show their values.
 pytest.register_assert_rewrite(
     "tsbench.testing.arrays", "tsbench.testing.contracts", "tsbench.testing.episodes"
 )
 
+from tsbench.testing.arrays import ArrayContract  # noqa: E402
+from tsbench.testing.contracts import MethodContract, PlanningContract, TaskContract  # noqa: E402
+
 __all__ = ["ArrayContract", "MethodContract", "PlanningContract", "TaskContract"]
-
-
-def __getattr__(name: str) -> Any:
-    """Imports a contract when it is asked for: they need dm_control, and `engines` does not."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    part = "arrays" if name == "ArrayContract" else "contracts"
-    return getattr(import_module(f"{__name__}.{part}"), name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,6 +28,7 @@ from tsbench.planning.roadmap import find_route
 from tsbench.runs import config, execute
 from tsbench.sim.kinematic import Planning, plan_along, rolled_out
 from tsbench.sim.model import fingerprint
+from tsbench.sim.promises import check_promises
 from tsbench.sim.tracking import Imitation
 from tsbench.testing.episodes import (
     Case,
@@ -227,6 +228,10 @@ class TaskContract(Contract):
         assert tasks.standard(task)
         assert fingerprint(task.spec()) == fingerprint(tasks.make(name).spec())
         json.dumps(dict(task.constants()))  # their hash goes into scores
+
+    def test_it_keeps_its_promises(self, name: str) -> None:
+        """Attributes, model, and shapes and types of what its functions return."""
+        check_promises(name, tasks.make(name))
 
     def test_changed_constants_are_not_standard(self, name: str) -> None:
         task = tasks.make(name)
@@ -459,6 +464,11 @@ def bits(policy: Policy) -> bytes:
     return b"".join(array.tobytes() for array in arrays)
 
 
+def required(item: Field[Any]) -> bool:
+    """Whether a field of a dataclass has no default."""
+    return item.default is MISSING and item.default_factory is MISSING
+
+
 class MethodContract:
     """Tests of a method.
 
@@ -498,7 +508,8 @@ class MethodContract:
     def test_its_options_are_in_its_configuration(self, name: str) -> None:
         """`key=value` words and `--cfg job` find a method's options in its configuration file."""
         options = methods.find(name).Options
-        assert options() == options()
+        without = [item.name for item in fields(options) if required(item)]
+        assert not without, f"fields of Options without a default: {without}"
         chosen = config.compose([f"task={self.task}", f"method={name}"]).method
         assert chosen == {**vars(options()), "name": name}
 

@@ -93,7 +93,7 @@ def subject(word: str) -> Subject:
         TsbenchError: the task, directory or file does not exist, or is damaged.
     """
     if word.startswith("task="):
-        return task_subject(tasks.make(word.removeprefix("task=")))
+        return task_subject(tasks.checked(word.removeprefix("task=")))
     path = Path(word)
     if path.is_dir() or not path.exists():
         return run_subject(RunDirectory(path))
