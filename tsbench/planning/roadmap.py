@@ -157,8 +157,8 @@ def straightened(space: RoadmapSpace[Any], corners: np.ndarray) -> np.ndarray:
     """The corners (k, d) of a way, with shortcuts.
 
     The points of the way after each plan step, or fewer on a long way, and its corners are joined
-    to all others that they can move straight to, and the cheapest way through them is taken; again
-    as long as that helps.
+    to all others that they can move straight to, and the cheapest way through them is taken. This
+    is repeated as long as it helps.
     """
     cost = np.inf
     for _ in range(ROUNDS):
