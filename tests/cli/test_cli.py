@@ -83,8 +83,11 @@ def test_list_shows_tasks_without_a_configuration(
         return tasks.make(tasks.names()[0])
 
     assert verbs.main(["list"]) == 0
-    row = next(line for line in capsys.readouterr().out.splitlines() if "stroll" in line)
+    lines = capsys.readouterr().out.splitlines()
+    row = next(line for line in lines if "stroll" in line)
     assert row.count("-") == 3
+    lack = "the task 'stroll' cannot be run: its package lacks conf/task/stroll.yaml"
+    assert f"Incomplete: {lack}" in lines
 
 
 def test_list_is_quick_because_it_leaves_learning_alone() -> None:
@@ -117,7 +120,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
         (["view", "nowhere", "--html", "x.html"], "no run directory nowhere"),
         (["view", "task=rocket_navigatoin"], "(did you mean 'rocket_navigation'?)"),
         (["view", TASK, "--push", "100N"], "cannot read the push '100N'"),
-        (["view", TASK, "--push", "9N@1s:+x"], "only what a policy executes can be pushed"),
+        (["view", TASK, "--push", "9N@1s:+x"], "a plan cannot be pushed"),
         (["view", TASK, "--port", "70000"], "must be a whole number from 0 to 65535"),
         (["view", "/dev/null"], "damaged plan file /dev/null"),
         (["view", TASK, "--html", "/proc/none/x"], "/proc/none/x: No such file"),
@@ -190,7 +193,7 @@ def test_the_configuration_can_be_shown(capsys: pytest.CaptureFixture[str], tmp_
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("tsbench ", "run evaluate view report bench list"),
+        ("tsbench ", "run evaluate view report tune collect figures bench list"),
         ("tsbench run task=rocket_n", "task=rocket_navigation"),
         ("tsbench run task=rocket_navigation bud", "budget="),
     ],

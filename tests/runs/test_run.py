@@ -235,7 +235,7 @@ def test_another_physics_is_played_beside_and_never_kept(
     words = ["evaluate", "one", "--physics", "half_step", "--json", "two.json"]
     assert cli.main(words) == 0
     shown = capsys.readouterr().out
-    assert "verdicts that flip in physics half_step" in shown
+    assert "verdicts that change in physics half_step" in shown
     assert "compared bit for bit: equal" in shown  # the certified score
     content = json.loads(Path("two.json").read_text())
     score = plain(RunDirectory(finished).record().score.as_dict())
@@ -253,10 +253,10 @@ def test_another_physics_is_played_beside_and_never_kept(
         "recovered, pushes": 2 * 4 * 2,
     }
     assert cli.main(["evaluate", "one", "--physics", "round"]) == 2
-    assert "unknown physics 'round'; allowed: elliptic, half_step" in capsys.readouterr().err
+    assert "unknown physics 'round'; allowed: elliptic, half_step, warp" in capsys.readouterr().err
     keep = ["evaluate", "one", "--protocol", quick, "--physics", "elliptic", "--keep", "board"]
     assert cli.main(keep) == 2
-    assert "--keep keeps certified scores: leave out --physics" in capsys.readouterr().err
+    assert "--keep copies scores by a protocol alone: leave out --ph" in capsys.readouterr().err
     assert not Path("board").exists()
 
 
@@ -581,6 +581,14 @@ def test_a_plan_that_fails_its_audit_ends_the_run(tmp_path: Path) -> None:
     assert "resume" not in str(caught.value)
     assert (tmp_path / "mine" / "plan.npz").exists()
     assert not (tmp_path / "mine" / "policy.safetensors").exists()
+
+
+def test_a_plan_alone_is_not_removed(tmp_path: Path, naive_plan: Callable[[str], Plan]) -> None:
+    """A roadmap's plan may fail its audit before anything is learned; the error names its place."""
+    place = RunDirectory(tmp_path)
+    assert not place.trained
+    naive_plan("rocket_navigation").save(place.plan_file)
+    assert place.trained
 
 
 # A goal so near that an episode takes 1.5 s.

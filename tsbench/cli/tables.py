@@ -1,4 +1,4 @@
-"""Results as the user sees them."""
+"""The tables and lines that show results."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from tsbench.evaluation.flips import Flips
 from tsbench.evaluation.score import Score
 from tsbench.evaluation.words import FIGURES, counts, episode_rows, push_rows, verdict
 from tsbench.runs.directory import Record, RunDirectory
+from tsbench.viewer.paper import scores
 
 HEADLINES = ("solved_reward", "normalized_reward", "against_plan")
 
 
 def score_table(title: str, score: Score, task: Task[Any]) -> Table:
-    """A score: perturbed starts beside the task's own, changed physics, and pushes."""
+    """The table of a score: perturbed starts, the task's own start, changed physics and pushes."""
     perturbed = score.perturbed
     table = Table(
         title=escape(title),
@@ -43,16 +44,16 @@ def score_table(title: str, score: Score, task: Task[Any]) -> Table:
         solved = f"{counts(change)[0]} of {change.episodes}"
         table.add_row(name, solved, number(change.normalized_reward))
     table.add_section()
-    table.add_row("pushes", "survived", "and solved", style="bold")
+    table.add_row("pushes", "survived", "task solved", style="bold")
     for label, survived, recovered in push_rows(score):
         table.add_row(label, survived, recovered)
     return table
 
 
 def flips_table(physics: str, found: Sequence[Flips]) -> Table:
-    """How many verdicts are others in another physics."""
+    """The numbers of verdicts that change in other physics."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column(f"verdicts that flip in physics {physics}")
+    table.add_column(f"verdicts that change in physics {physics}")
     table.add_column("flipped", justify="right")
     table.add_column("share", justify="right")
     for one in found:
@@ -61,7 +62,7 @@ def flips_table(physics: str, found: Sequence[Flips]) -> Table:
 
 
 def show_run(console: Console, record: Record, task: Task[Any]) -> None:
-    """Prints what ends a run: its score and what each stage cost."""
+    """Prints the score of a finished run and the cost of each stage."""
     table = score_table(record.title, record.score, task)
     table.add_section()
     table.add_row("stage", "steps", "time", style="bold")
@@ -71,19 +72,34 @@ def show_run(console: Console, record: Record, task: Task[Any]) -> None:
     show_rank(console, record.standard, record.score)
 
 
+def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
+    """Prints the scores of many runs: a table for each task, a column for each method."""
+    for task in dict.fromkeys(line.group.task for line in lines):
+        own = [line for line in lines if line.group.task == task]
+        table = Table(title=task, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        for header in ("", *(line.group.label for line in own)):
+            table.add_column(escape(header), overflow="fold")
+        columns = [scores.cells(line) for line in own]
+        for row in zip(scores.COLUMNS[2:-1], *(one[2:-1] for one in columns), strict=True):
+            table.add_row(*(escape(one.replace(" [", "\n[")) for one in row))
+        for name in own[0].measures:
+            table.add_row(name, *(number(line.measures[name]) for line in own))
+        console.print(table)
+
+
 def show_places(console: Console, run: RunDirectory) -> None:
-    """Prints where to look at a finished run next."""
-    for what, where in (
-        ("what came out", run.report_file),
-        ("score it again", f"tsbench evaluate {run.path}"),
+    """Prints the report's path and the command that makes the score again."""
+    for label, place in (
+        ("report", run.report_file),
+        ("score again", f"tsbench evaluate {run.path}"),
     ):
-        console.print(f" {what:<17} {where}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f" {label:<12} {place}", markup=False, highlight=False, soft_wrap=True)
 
 
 def show_rank(console: Console, standard: bool, score: Score) -> None:
-    """Says why a score cannot be ranked with others, where it cannot."""
+    """Prints why a score is not ranked, if so."""
     reasons = [] if standard else ["the task's constants were changed"]
     if not score.origin.protocol.ranked:
-        reasons.append(f"protocol {score.protocol} asks too little")
+        reasons.append(f"protocol {score.protocol} plays too few episodes")
     if reasons:
-        console.print(f" not to be ranked: {' and '.join(reasons)}", highlight=False)
+        console.print(f" not ranked: {' and '.join(reasons)}", highlight=False)

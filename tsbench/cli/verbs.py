@@ -23,22 +23,26 @@ from tsbench.gl import find_working_backend
 RUN_HELP = """\
 usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
 
-Trains a policy, evaluates it on the original task and leaves a run directory that explains itself.
+Trains a policy, evaluates it on the task and writes a run directory with a report.
 
 words, in Hydra's grammar:
-  task=NAME        what to solve; `tsbench list` names them
-  method=NAME      what solves it (twostage)
+  task=NAME        the task; `tsbench list` names all
+  method=NAME      the method (twostage)
   budget=NAME      smoke: seconds, fast: the standard, paper: the published one (fast)
-  seed=N           everything random comes from it (0)
+  seed=N           the seed of all random numbers (0)
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
-  resume=RUN       goes on with an interrupted run, to the same bits; alone, without other words
+  device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
+  deterministic=true
+                   the same bits each time on a GPU, for more time
+  resume=RUN       continues an interrupted run to the same result, bit for bit; takes no other
+                   words
   method.KEY=...   an option of the method
   task.training.STAGE.KEY=...
                    a PPO setting of the plan, imitate, finetune or task stages
   task.constants.KEY=...
-                   a constant of the task, for studies: such a score cannot be ranked
+                   a constant of the task, for studies: such a score is not ranked
 
 options:
   --cfg job        show the configuration and stop
@@ -51,6 +55,24 @@ examples:
   tsbench run -m task=laikago_walk,laikago_trot 'seed=range(0,3)'
 """
 
+
+TUNE_HELP = """\
+usage: tsbench tune task=NAME method=NAME trials=N [study=PATH] [key=value ...] [options]
+
+Finds good settings of a method by Optuna's multivariate TPE, and prints the words of the best ones.
+Processes that are given the same words work on one study together, and a study goes on where it
+was interrupted. docs/tuning.md says what a trial is and what it is worth.
+
+words:
+  trials=N         trials of the whole study, pruned and failed ones among them
+  study=PATH       directory of the journal and the runs (studies/TASK/METHOD-BUDGET)
+  task=, method=, budget=, threads=, key=value
+                   as of `tsbench run`, for all trials; a key that is given is not tuned
+
+options:
+  --best           only print the words of the best trial so far
+  --json FILE      write them to a new JSON file too, with the number of trials spent
+"""
 
 JSON_HELP = "write what is shown to a new JSON file too"
 PICTURES = ("--video", "--strip")  # options that need OpenGL
@@ -121,6 +143,9 @@ def _dispatch(words: list[str]) -> int:
     elif words[0] in VERBS:
         if words[0] == "view" and any(w.startswith(PICTURES) for w in words):
             find_working_backend()
+        if words[0] == "figures":
+            with suppress(TsbenchError):  # only the motion strips are then left out
+                find_working_backend()
         _check_graphics()
         return VERBS[words[0]].call(words[1:]) or 0
     else:
@@ -192,9 +217,16 @@ def _list(words: Sequence[str]) -> None:
     from tsbench.core import plugins
     from tsbench.core.files import write_json
     from tsbench.runs import config
+    from tsbench.sim.promises import check_promises
 
-    made = {name: tasks.make(name) for name in tasks.names()}
-    budgets = {name: config.budgets(name) for name in made}
+    made, budgets, faults = {}, {}, []
+    for name in tasks.names():
+        try:
+            made[name], budgets[name] = tasks.make(name), config.budgets(name)
+            if tasks.provider(name) != plugins.own():  # the contract tests check tsbench's own
+                check_promises(name, made[name])
+        except TsbenchError as error:
+            faults.append(str(error))
     rows = {
         name: {
             "version": task.version,
@@ -211,6 +243,7 @@ def _list(words: Sequence[str]) -> None:
             if (provider := kind.provider(name)) not in (None, plugins.own()):
                 brought.setdefault(str(provider), []).append(name)
     refused = tuple(dict.fromkeys((*tasks.refused(), *methods.refused())))
+    incomplete = (*config.incomplete(), *faults)
     offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for header in ("task", "version", "seconds", *offered):
@@ -227,10 +260,12 @@ def _list(words: Sequence[str]) -> None:
         table.add_row(name, summary)
     console.print(table)
     lines = [f"Plug-in {provider}: {', '.join(names)}" for provider, names in brought.items()]
-    for line in (*lines, *(f"Refused: {line}" for line in refused)):
+    lines += [f"Refused: {line}" for line in refused]
+    lines += [f"Incomplete: {line}" for line in incomplete]
+    for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     shown = {"tasks": rows, "methods": summaries, "plug-ins": brought, "refused": refused}
-    write_json(options.json, shown)
+    write_json(options.json, {**shown, "incomplete": incomplete})
 
 
 def _short(steps: int) -> str:
@@ -269,17 +304,25 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="POLICY_OR_RUN",
         help="directory with a policy in it, .onnx file, stable-baselines3 .zip, zero or random",
     )
-    parser.add_argument("task", nargs="?", metavar="task=NAME", help="where the policy says none")
+    parser.add_argument(
+        "task", nargs="?", metavar="task=NAME", help="for a policy that names no task"
+    )
     parser.add_argument(
         "--protocol",
         metavar="NAME",
-        help="v1 or smoke, which takes seconds (as the run was scored, else v1)",
+        help="v1, or smoke, which takes seconds (the protocol of the run's score, else v1)",
     )
-    help_physics = "elliptic or half_step: play it there too, and count the verdicts that flip"
+    help_physics = (
+        "elliptic, half_step or warp: also play the protocol there and count changed verdicts"
+    )
     parser.add_argument("--physics", metavar="NAME", help=help_physics)
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
-    parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
-    help_keep = "copy a finished run and this score into a new directory, as leaderboards/ has it"
+    parser.add_argument(
+        "--trust-sb3",
+        metavar="ALGORITHM",
+        help="the algorithm that saved the .zip, which can run any code when it is loaded",
+    )
+    help_keep = "copy a finished run and this score into a new directory, as in leaderboards/"
     parser.add_argument("--keep", type=Path, metavar="DIRECTORY", help=help_keep)
     options = parser.parse_args(words)
     from tsbench import tasks
@@ -305,9 +348,10 @@ def _evaluate(words: Sequence[str]) -> int:
     if options.keep is not None:
         directory.check_keep(run, options.keep, protocol)
         if options.physics is not None:
-            parser.error("--keep keeps certified scores: leave out --physics")
+            parser.error("--keep copies scores by a protocol alone: leave out --physics")
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
+    engine = _engine(options.physics)
     console, standard = Console(), tasks.standard(task)
     with progress_bar(console, "evaluate") as progress:
         score = evaluate(
@@ -331,12 +375,13 @@ def _evaluate(words: Sequence[str]) -> int:
                 protocol=protocol.elsewhere(options.physics),
                 threads=options.threads,
                 progress=progress,
+                engine=engine,
             )
         flipped = flips(score, other)
         console.print(tables.flips_table(options.physics, flipped))
         console.print(
-            f" solved_reward {number(other.solved_reward)} in physics {options.physics}, "
-            f"{number(score.solved_reward)} certified; the first is never ranked or kept",
+            f" solved_reward: {number(score.solved_reward)} by protocol {protocol.name}, "
+            f"{number(other.solved_reward)} in physics {options.physics}, which is never ranked",
             highlight=False,
             soft_wrap=True,
         )
@@ -350,6 +395,21 @@ def _evaluate(words: Sequence[str]) -> int:
         directory.keep(run, options.keep, score)
         console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
     return 0
+
+
+def _engine(physics: str | None) -> Any:
+    """What plays a score in one of the other physics (`evaluation.protocol.PHYSICS`).
+
+    Raises:
+        TsbenchError: its packages are not installed.
+    """
+    if physics == "warp":
+        from tsbench.sim.warp import HostPhysics
+
+        return HostPhysics
+    from tsbench.sim.physics import Physics
+
+    return Physics
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
@@ -387,7 +447,7 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
         if path.exists() or str(path) in references.POLICIES:
             raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
         raise TsbenchError(f"no run directory {path}")
-    task = tasks.make(name)
+    task = tasks.checked(name)
     return references.named(path, task) or foreign.load(path, task, trust_sb3), task
 
 
@@ -456,7 +516,7 @@ def _port(word: str) -> int:
 def _report(words: Sequence[str]) -> None:
     parser = _parser("report", json=False)
     parser.add_argument("run", type=Path, metavar="RUN", help="a finished run's directory")
-    what = "the page to write, a new one (what RUN lacks of its report.html and view.html)"
+    what = "the new page (the missing ones of report.html and view.html in RUN)"
     parser.add_argument("--html", type=Path, metavar="FILE", help=what)
     options = parser.parse_args(words)
     from tsbench.core.files import check_new, write_new
@@ -474,10 +534,85 @@ def _report(words: Sequence[str]) -> None:
     sys.stdout.write(f"{path}\n")
 
 
+def _tune(words: Sequence[str]) -> None:
+    if "-h" in words or "--help" in words:
+        sys.stdout.write(TUNE_HELP)
+        return
+    try:
+        from tsbench.runs import tune
+    except ModuleNotFoundError as error:
+        if error.name != "optuna":
+            raise
+        raise TsbenchError("optuna is missing: pip install 'tsbench[tune]'") from None
+    from tsbench.core.files import write_json
+
+    parser = Parser("tsbench tune", add_help=False, allow_abbrev=False)
+    parser.add_argument("--best", action="store_true")
+    parser.add_argument("--json", type=_new_file)
+    options, others = parser.parse_known_args(words)
+    own = {"trials": "", "study": ""}
+    for key in own:
+        own[key] = next((w.partition("=")[2] for w in others if w.startswith(f"{key}=")), "")
+    common = [word for word in others if not word.startswith(tuple(f"{key}=" for key in own))]
+    study = tune.prepare(common, Path(own["study"]) if own["study"] else None)
+    if not options.best:
+        if not own["trials"]:
+            raise TsbenchError("trials=N is missing, the number of trials of the whole study")
+        try:
+            trials = _whole_number(own["trials"], 1, 10**6)
+        except argparse.ArgumentTypeError as error:
+            raise TsbenchError(f"trials {error}") from None
+        tune.tune(study, trials, told=lambda line: sys.stderr.write(f"{line}\n"))
+    trial, spent = tune.best(study)
+    chosen = study.chosen(trial.params)
+    sys.stdout.write(f"tsbench run {' '.join(chosen)}\n")
+    figures = {"words": chosen, "value": trial.value, "trial": trial.number, "trials": spent}
+    write_json(options.json, {**figures, "seeds": study.seeds})
+
+
+def _collect(words: Sequence[str]) -> None:
+    parser = _parser("collect", json=False)
+    what = "runs, entries, results folders, or folders with such in them"
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS", help=what)
+    out = "the results folder, which is made where there is none"
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=out)
+    trials = "trials that were spent on tuning the settings of these runs"
+    parser.add_argument("--trials", type=_trials, metavar="N", help=trials)
+    options = parser.parse_args(words)
+    from tsbench.runs import results
+
+    found = results.read(options.runs)
+    kept = results.collect(found, options.out, options.trials)
+    sys.stdout.write(f"{options.out}: {len(found.rows)} added, {len(kept.rows)} in all\n")
+
+
+def _trials(word: str) -> int:
+    return _whole_number(word, 0, 10**6)
+
+
+def _figures(words: Sequence[str]) -> None:
+    parser = _parser("figures", json=False)
+    what = "runs, entries, results folders, or folders with such in them"
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS", help=what)
+    out = "a new folder, which gets index.html and the figures as PNG, SVG and CSV"
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=out)
+    options = parser.parse_args(words)
+    from tsbench.cli import tables
+    from tsbench.runs import results
+    from tsbench.viewer.paper import page
+
+    lines, remarks = page.write(results.read(options.runs), options.out)
+    console = Console()
+    tables.show_scores(console, lines)
+    for line in remarks:
+        console.print(f" {line}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f" {options.out / 'index.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
     parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
-    parser.add_argument("--quick", action="store_true", help="a minute, with larger ranges")
+    parser.add_argument("--quick", action="store_true", help="a minute, with wider ranges")
     options = parser.parse_args(words)
     from tsbench import bench
     from tsbench.bench import table
@@ -493,9 +628,12 @@ def _bench(words: Sequence[str]) -> None:
 
 VERBS = {
     "run": Verb("train a policy and evaluate it", _run),
-    "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
-    "view": Verb("see a run, a plan or a task move: live, as a page or as a video", _view),
-    "report": Verb("write one page about a run: what was planned, done and learned", _report),
-    "bench": Verb("measure how fast it is, side by side with others", _bench),
+    "evaluate": Verb("score a policy by a protocol", _evaluate),
+    "view": Verb("show a run, a plan or a task in motion: live, as a page or as a video", _view),
+    "report": Verb("write one page about a run: plan, motion, score and learning", _report),
+    "tune": Verb("search for good settings of a method, shared by processes", _tune),
+    "collect": Verb("keep the scores, curves and best policies of many runs as data", _collect),
+    "figures": Verb("make the paper's figures and its table again, from runs or results", _figures),
+    "bench": Verb("measure speed, beside alternatives", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }

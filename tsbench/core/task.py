@@ -4,8 +4,8 @@ Four interfaces, each of which adds to the one before:
 
 - `MDP`: observations, rewards and endings as functions of states, independent of the dynamics.
 - `SimulatedTask`: an MDP that is stepped in full physics, by the `Plant` that it names.
-- `Task`: that can be scored: what success is, what else to measure, when to push, which motion is
-  the best known.
+- `Task`: a simulated task that can be scored. It defines success, further measures, the instants of
+  pushes, and the best motion known.
 - `Plannable`: with a planning variant (`Abstraction`) and an imitation variant (`Tracker`).
 
 A new task is one class that implements `Task` or `Plannable`. Everything here is pure functions
@@ -27,7 +27,8 @@ import numpy as np
 from tsbench.core.arrays import Array, array_namespace, step_of
 from tsbench.core.drawing import Drawing
 from tsbench.core.errors import TsbenchError, unknown
-from tsbench.core.motion import Audit, Plan, ReferenceMotion
+from tsbench.core.motion import Audit, Plan, ReferenceMotion, Roadmap
+from tsbench.core.roadmap import Lattice, RoadmapSpace
 from tsbench.core.state import Course, Readings, Rng, S, Start
 
 Vector = tuple[float, float, float]
@@ -81,8 +82,7 @@ class MDP(ABC, Generic[S]):
         return state.time < 0.0
 
     def violated(self, state: S) -> Array:
-        """Whether something happened that spoils the episode for good (a fall, a collision),
-        shape (...,)."""
+        """Whether this state spoils the episode for good (a fall, a collision), shape (...,)."""
         return state.time < 0.0
 
     def begun(self, state: S) -> Course:
@@ -93,33 +93,34 @@ class MDP(ABC, Generic[S]):
         """The course after the step from `previous` to `state`."""
         return course.replace(violated=course.violated | self.violated(state))
 
-    # Arriving: the one rule that scores and learners share. An episode that ends at its goal,
-    # with nothing violated on the way, is credited for the steps that it spares: else hovering
-    # just outside the goal would earn more than arriving.
+    # Arriving: one rule for scores and learners. An episode that ends at its goal without a
+    # violation is credited for the steps that it spares. Without this credit, hovering just outside
+    # the goal would earn more than arriving.
 
     def spared(self, state: S, course: Course) -> Array:
-        """Steps that an episode which ends in this state does not need, since it has arrived;
-        integers, zero unless it has, shape (...,).
+        """The number of steps that an arrival leaves of the horizon, zero for an episode that has
+        not arrived; integers, shape (...,).
 
         Args:
-            state: that the episode ended in, for a reason other than its last step.
-            course: that led there.
+            state: the state in which the episode ended, for a reason other than its last step.
+            course: the course of the episode.
         """
         xp = array_namespace(state.time)
         arrived = self.reached(state) & ~course.violated
         return xp.where(arrived, self.horizon - step_of(state.time, self.timestep), 0)
 
     def quality(self, course: Course) -> Array:
-        """What a spared step is worth beside a perfect one, in [0, 1], shape (...,): how well the
-        episode did on its way what the task asks for beside arriving."""
+        """The worth of a spared step as a share of a perfect step, in [0, 1], shape (...,). It says
+        how well the episode met the task's demands on the way, such as the footfall; by default
+        1."""
         return 1.0 - 0.0 * course.violated
 
     def credit(self, spared: Array, quality: Array, discount: float = 1.0) -> Array:
-        """What spared steps earn.
+        """The reward of spared steps, shape (...,).
 
         Args:
-            spared: steps, floating-point numbers, shape (...,).
-            quality: what each is worth beside a perfect one, shape (...,).
+            spared: numbers of steps as floating-point numbers, shape (...,).
+            quality: worth of each step as a share of a perfect step, shape (...,).
             discount: gamma per time step; the first spared step is discounted once.
         """
         if discount != 1.0:
@@ -151,9 +152,10 @@ class Plant(ABC, Generic[S]):
         """The model, with goal and obstacles in it. The viewer frames and labels what is named
         `goal` (a site) and `obstacle_1`, `obstacle_2`, ... (spheres)."""
 
-    @abstractmethod
     def control(self, state: S, action: Array) -> tuple[Array, Array]:
-        """Actuator controls (..., nu) for an action, and the memory (..., m) for the next state."""
+        """Actuator controls (..., nu) for an action, and the memory (..., m) for the next state. By
+        default the controls are the clipped action, and the memory stays as it is."""
+        return array_namespace(action).clip(action, -1.0, 1.0), self.memory(state)
 
     @abstractmethod
     def read(self, readings: Readings) -> S:
@@ -188,7 +190,7 @@ class Task(SimulatedTask[S], Plant[S]):
     """A task that can be scored. It is its own plant.
 
     Attributes:
-        measure_notes: what each of `measures` says, in words, by its name.
+        measure_notes: the meaning of each of `measures` in words, by name.
     """
 
     measure_notes: Mapping[str, str] = MappingProxyType({})
@@ -199,34 +201,34 @@ class Task(SimulatedTask[S], Plant[S]):
 
     @property
     def mishap(self) -> str:
-        """What a violation is, in words that follow "without": "a fall"."""
+        """A violation in words that follow "without", such as "a fall"."""
         return "a violation"
 
     @abstractmethod
     def success(self, state: S, course: Course) -> Array:
         """Whether an episode that ended in `state` after this course is solved, shape (...,)."""
 
-    # Measures: what an episode did, in figures that mean something by themselves.
+    # Measures: figures of an episode with a meaning and unit of their own.
 
     def measured(self, previous: S, action: Array | None, state: S) -> dict[str, Array]:
-        """What a step adds to sums over the episode that `measures` needs, by name, each of shape
-        (...,); by default nothing. `action` is None where nothing acted, as along a plan: what
-        needs one is then left out."""
+        """The terms that a step adds to the episode's sums for `measures`, by name, each of shape
+        (...,); by default none. `action` is None for a plan; terms that need an action are then
+        left out."""
         return {}
 
     def measures(
         self, first: S, last: S, course: Course, sums: Mapping[str, Array], steps: Array
     ) -> dict[str, Array]:
-        """What there is to say of finished episodes beside their reward: figures by name, with the
-        unit in the name, what matters most first; not a number where an episode has none. By
-        default there are none.
+        """Figures of finished episodes beside their reward, by name, the main ones first. A name
+        includes the unit. A figure is not a number for an episode without it. By default there are
+        none.
 
         Args:
-            first: the state that the episode began in.
-            last: the state that it ended in.
-            course: that led there.
-            sums: of what its steps `measured`.
-            steps: that it took, shape (...,).
+            first: the state in which the episode began.
+            last: the state in which the episode ended.
+            course: the course of the episode.
+            sums: the sums of the terms that its steps `measured`.
+            steps: the number of its steps, shape (...,).
 
         Returns:
             Each of shape (...,).
@@ -308,6 +310,17 @@ class Abstraction(ABC, Generic[S]):
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
         """Full poses: abstract coordinates (k, len(coordinates)) -> qpos (k, nq)."""
 
+    # For planners that do not learn
+
+    def roadmap_space(self) -> RoadmapSpace[S] | None:
+        """The points that a roadmap joins; by default there are none."""
+        return None
+
+    def lattice(self) -> Lattice | None:
+        """The nodes of a cyclic motion that keeps the task's schedule; by default there are
+        none."""
+        return None
+
 
 class Tracker(ABC, Generic[S]):
     """The reward, ending and start of a task's imitation variant, given a reference motion.
@@ -373,17 +386,25 @@ class Plannable(Task[S]):
             raise unknown(f"imitation reward of {self.name}", form, self.imitation_forms)
         return form
 
+    def check_origin(self, made: Plan | ReferenceMotion | Roadmap) -> None:
+        """Checks that something was made for this task.
+
+        Raises:
+            TsbenchError: it was made for another task or version.
+        """
+        if (made.task, made.task_version) != (self.name, self.version):
+            raise TsbenchError(
+                f"the {made.kind} is for {made.task} version {made.task_version}, "
+                f"not for {self.name} version {self.version}"
+            )
+
     def check_fit(self, motion: Plan | ReferenceMotion) -> None:
         """Checks that a plan or reference motion belongs to this task.
 
         Raises:
             TsbenchError: the motion is for another task or version, or its arrays have other sizes.
         """
-        if (motion.task, motion.task_version) != (self.name, self.version):
-            raise TsbenchError(
-                f"the {motion.kind} is for {motion.task} version {motion.task_version}, "
-                f"not for {self.name} version {self.version}"
-            )
+        self.check_origin(motion)
         found: dict[str, tuple[int, ...]]
         wanted: dict[str, tuple[int, ...]]
         if isinstance(motion, Plan):
@@ -410,3 +431,15 @@ def plannable(task: MDP[S]) -> Plannable[S]:
     if not isinstance(task, Plannable):
         raise TsbenchError(f"{task.name} has no planning variant, which this needs")
     return task
+
+
+def roadmap_space(task: MDP[S], method: str) -> RoadmapSpace[S]:
+    """The points that a roadmap of the task joins.
+
+    Raises:
+        TsbenchError: the task has none, so that the method cannot do it.
+    """
+    space = task.abstraction().roadmap_space() if isinstance(task, Plannable) else None
+    if space is None:
+        raise TsbenchError(f"the method {method} cannot do {task.name}: it has no roadmap space")
+    return space

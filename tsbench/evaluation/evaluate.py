@@ -1,4 +1,4 @@
-"""How a policy is scored, by a protocol."""
+"""Scores a policy by a protocol."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import V1, Condition, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import robustness
 from tsbench.evaluation.score import Score, Summary
+from tsbench.sim.dynamics import Engine
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
 from tsbench.sim.physics import Physics
@@ -29,15 +30,18 @@ def evaluate(
     protocol: Protocol = V1,
     threads: int | None = None,
     progress: Callable[[float], None] | None = None,
+    engine: Engine = Physics,
 ) -> Score:
     """Scores a policy.
 
     Args:
-        policy: of the task.
-        task: with the constants that it is scored under.
-        protocol: that says how.
-        threads: for the physics, None for all cores; they change nothing but the time.
-        progress: is told now and then which share is done, up to 1.
+        policy: a function from observations of the task to actions.
+        task: the task, with the constants under which the policy is scored.
+        protocol: the protocol of the score.
+        threads: of the physics, None for all cores. Their number changes only the time taken.
+        progress: called now and then with the share that is done, up to 1.
+        engine: the physics that plays everything. Only scores by `Physics` can be ranked; for
+            another engine the protocol must be of other physics (`Protocol.elsewhere`).
 
     Raises:
         TsbenchError: the policy was trained for another task, version or physics.
@@ -50,8 +54,8 @@ def evaluate(
     here = Condition(protocol.name, protocol.physics)
     starts = perturbed_starts(task, protocol)
     some = starts.rows(slice(0, protocol.changed))
-    nominal = _play(policy, task, task.start(np.random.default_rng(0), 1), here, threads)
-    perturbed = _play(policy, task, starts, here, threads)
+    nominal = _play(policy, task, task.start(np.random.default_rng(0), 1), here, threads, engine)
+    perturbed = _play(policy, task, starts, here, threads, engine)
     summary = _summary(task, perturbed)
     return Score(
         protocol=protocol.name,
@@ -63,11 +67,12 @@ def evaluate(
         nominal=_summary(task, nominal),
         changes={
             condition.name: _summary(
-                task, _play(policy, task, some, condition.on(protocol.physics), threads)
+                task,
+                _play(policy, task, some, condition.on(protocol.physics), threads, engine),
             )
             for condition in protocol.conditions
         },
-        robustness=robustness(policy, task, protocol, threads),
+        robustness=robustness(policy, task, protocol, threads, engine),
         origin=origin,
         log=ActionLog(
             task=task.name,
@@ -82,8 +87,8 @@ def evaluate(
 def _watched(
     policy: PolicyFunction, task: Task[Any], protocol: Protocol, progress: Callable[[float], None]
 ) -> PolicyFunction:
-    """The policy, telling how many of all observations it has answered. Episodes that end early
-    make it jump."""
+    """The same policy, which also reports the share of all observations that it has answered. An
+    episode that ends early makes the share jump."""
     phases = np.array(task.push_steps[:: protocol.phases])
     pushes = len(protocol.forces) * protocol.headings * int((task.horizon - phases).sum())
     episodes = 2 + protocol.perturbed + len(protocol.conditions) * protocol.changed
@@ -103,7 +108,8 @@ def _logged(nominal: np.ndarray, perturbed: np.ndarray, protocol: Protocol) -> n
 
 
 def check_fit(policy: Policy, task: Task[Any]) -> None:
-    """
+    """Checks that a policy was trained for this task.
+
     Raises:
         TsbenchError: the policy was trained for another task, version or physics.
     """
@@ -124,10 +130,11 @@ def _play(
     task: Task[Any],
     starts: Start,
     condition: Condition,
-    threads: int | None = None,
+    threads: int | None,
+    engine: Engine,
 ) -> Episodes[Any]:
     count = len(starts.time)
-    physics: Physics[Any] = Physics(task, count, threads=threads, change=condition.change)
+    physics = engine(task, count, threads=threads, change=condition.change)
     begin = physics.place(np.arange(count), starts)
     delay = condition.delay
     return play(task, physics, policy, count, begin=begin, delay=delay, measure=task.measured)

@@ -13,7 +13,7 @@ import yaml
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import check_new, write_json
-from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
+from tsbench.core.motion import ActionLog, Plan, ReferenceMotion, Roadmap
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
@@ -119,6 +119,7 @@ class RunDirectory:
     dump_file = _File("not-finite.npz")
     plan_file = _File("plan.npz")
     reference_file = _File("reference.npz")
+    roadmap_file = _File("roadmap.npz")
     policy_info_file = _File("policy.json")
     policy_file = _File("policy.safetensors")
     actions_file = _File("actions.npz")
@@ -134,8 +135,9 @@ class RunDirectory:
 
     @property
     def trained(self) -> bool:
-        """Whether the directory holds training progress, so that it must not be removed."""
-        return self.metrics_file.exists() and self.metrics_file.stat().st_size > 0
+        """Whether the directory holds training progress or a plan, which must not be removed."""
+        metrics = self.metrics_file
+        return (metrics.exists() and metrics.stat().st_size > 0) or self.plan_file.exists()
 
     @property
     def finished(self) -> bool:
@@ -153,7 +155,7 @@ class RunDirectory:
     @property
     def optional(self) -> tuple[Path, ...]:
         """The files that an entry has if its method makes them."""
-        return self.plan_file, self.reference_file
+        return self.plan_file, self.reference_file, self.roadmap_file
 
     def config(self) -> RunConfig:
         """The configuration of the run."""
@@ -220,6 +222,18 @@ class RunDirectory:
         """
         return _motion(ReferenceMotion, self.reference_file, task)
 
+    def roadmap(self, task: Task[Any]) -> Roadmap | None:
+        """The roadmap that the run planned with, or None if it used none.
+
+        Raises:
+            TsbenchError: the file is damaged, or the roadmap is another task's.
+        """
+        if not self.roadmap_file.exists():
+            return None
+        roadmap = Roadmap.load(self.roadmap_file)
+        plannable(task).check_origin(roadmap)
+        return roadmap
+
     def actions(self) -> ActionLog | None:
         """The run's action log, or None if it has none."""
         return ActionLog.load(self.actions_file) if self.actions_file.exists() else None
@@ -267,6 +281,7 @@ def check_keep(run: RunDirectory, entry: Path, protocol: Protocol) -> None:
             raise TsbenchError(f"{run.path} mixes several runs: its files disagree on the {what}")
     run.plan(task)
     run.reference(task)
+    run.roadmap(task)
     check_new(entry, parents=True)
 
 

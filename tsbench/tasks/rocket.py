@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -19,9 +19,10 @@ from tsbench.core.arrays import Array, array_namespace, like
 from tsbench.core.constants import constant
 from tsbench.core.drawing import Drawing, Flame
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.roadmap import DrivableSpace
 from tsbench.core.state import Course, Readings, Rng, Start, State
 from tsbench.core.task import Abstraction, Plannable, Tracker
-from tsbench.planning.path import Path
+from tsbench.planning.path import Path, segment_distance
 from tsbench.sim.model import load_spec
 from tsbench.tasks import register
 
@@ -61,6 +62,8 @@ C = Constants()
 
 # The paper prints degrees; spec section 1 says why this is in radians.
 PLAN_TURN = 0.05  # rad per plan step (P, unit D)
+
+ROADMAP_SLACK = 1e-6  # m, by which the ways of a roadmap clear obstacles more than they must
 
 # Constants of the imitation reward, on which no score depends.
 TRACKING_DECAY = -0.625  # k_imi (P)
@@ -125,8 +128,8 @@ class Rocket(Plannable[RocketState]):
     imitation_forms = ("progress", "paper")
     measure_notes = MappingProxyType(
         {
-            "time away from the goal, s": "more than 1 m from it",
-            "impulse of the engines, N s": "what fuel is spent on; hovering costs 12.5 a second",
+            "time away from the goal, s": "time more than 1 m from the goal",
+            "impulse of the engines, N s": "use of fuel; hovering costs 12.5 a second",
         }
     )
     pushed = "rocket"
@@ -244,11 +247,11 @@ class Rocket(Plannable[RocketState]):
         sums: Mapping[str, Array],
         steps: Array,
     ) -> dict[str, Array]:
-        """How long the rocket was away from its goal, and what it spent.
+        """Time away from the goal, and use of the engines.
 
-        time away from the goal, s: more than a success's distance from it; what an episode that
-            ends early leaves of its horizon counts as away.
-        impulse of the engines, N s: of main and side engines, each as the integral of its force.
+        time away from the goal, s: time farther from the goal than a success may be. After an early
+            end the rest of the horizon counts as away.
+        impulse of the engines, N s: integral of the forces of the main and the side engines.
         """
         missing = self.timestep * (self.horizon - steps)
         found = {"time away from the goal, s": sums["away"] + missing}
@@ -289,13 +292,16 @@ class Rocket(Plannable[RocketState]):
     def drawing(self) -> Drawing:
         low, high = (np.array([x, 0.0, z]) for x, z in self.bounds)
 
+        def still(position: np.ndarray) -> RocketState:
+            zeros = np.zeros(len(position))
+            return self.kinematic(zeros, position[:, [0, 2]], zeros)
+
         def worth(position: np.ndarray) -> np.ndarray:
-            still = np.zeros(len(position))
-            state = self.kinematic(still, position[:, [0, 2]], still)
-            reward: np.ndarray = self.reward(state, still, state)
+            state = still(position)
+            reward: np.ndarray = self.reward(state, state.time, state)
             return reward
 
-        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth)
+        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth, still=still)
 
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """At the origin, at rest, upright (P).
@@ -457,6 +463,48 @@ class RocketAbstraction(Abstraction[RocketState]):
 
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
         return coordinates
+
+    def roadmap_space(self) -> RocketSpace:
+        return RocketSpace(self.task)
+
+
+class RocketSpace(DrivableSpace[RocketState]):
+    """Positions in metres. The rocket stays upright: neither clearance nor reward depends on its
+    angle."""
+
+    near = C.success_distance
+
+    def __init__(self, task: Rocket) -> None:
+        self.obstacles = np.array(task.obstacles).reshape(-1, 2)
+        self.low, self.high = task.bounds
+        self.scale = np.full(2, C.plan_step)
+        self.start, self.goal = np.zeros(2), task.goal
+
+    def free(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """The whole way is farther from all obstacles than the audit of plans asks for."""
+        clear = np.ones(len(first), bool)
+        for obstacle in self.obstacles:
+            distance = segment_distance(obstacle, first, second)
+            clear &= distance >= C.obstacle_radius + C.hull_radius + ROADMAP_SLACK
+        return clear
+
+    def action(self, state: RocketState, point: np.ndarray) -> np.ndarray:
+        move = (point - state.position) / C.plan_step
+        return np.concatenate([move, np.zeros((1, 1))], axis=-1)
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        return np.insert(points, 1, 0.0, axis=-1)
+
+    def points(self, state: RocketState) -> np.ndarray:
+        return np.asarray(state.position)
+
+    def sent(self, state: RocketState, points: np.ndarray) -> RocketState:
+        return state.replace(position=state.position + (self.goal - points))
+
+    def moved(self, start: Start, points: np.ndarray) -> Start:
+        qpos = start.qpos.copy()
+        qpos[:, :2] += points - self.start
+        return replace(start, qpos=qpos)
 
 
 class RocketTracker(Tracker[RocketState]):
