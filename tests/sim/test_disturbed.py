@@ -104,6 +104,24 @@ def test_pushes_grow_over_the_first_steps() -> None:
         assert 0.9 * bound < largest() <= bound
 
 
+def test_latency_grows_over_the_first_steps() -> None:
+    """Up to 2 steps, drawn as the whole part of a uniform number below 1 + 2 x level: at level 0
+    none, at 0.25 below 1.5, so a third of the episodes are late by 1, at 1 thirds of each."""
+    task = tasks.make("rocket_navigation")
+    count = 3000
+    physics = DisturbedPhysics(task, count, Disturbances(latency=2, rise=8 * count), 0, threads=1)
+    rows, rng = np.arange(count), np.random.default_rng(0)
+    shares = {0: (1.0, 0.0, 0.0), 2: (2 / 3, 1 / 3, 0.0), 8: (1 / 3,) * 3, 9: (1 / 3,) * 3}
+    state = physics.begin(rng, rows)
+    for step in range(10):
+        if step in shares:
+            physics.begin(rng, rows)
+            found = np.bincount(physics.unseen()[0], minlength=3) / count
+            np.testing.assert_allclose(found, shares[step], atol=0.035)  # four deviations
+            assert np.all(found[np.array(shares[step]) == 0.0] == 0.0)
+        state = physics.advance(state, np.zeros((count, 2)))
+
+
 def test_some_episodes_are_calm() -> None:
     """Three tenths of the rows get no push at all; other rows in each episode."""
     task = tasks.make("rocket_navigation")

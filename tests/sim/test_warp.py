@@ -259,14 +259,16 @@ def test_disturbances_are_drawn_for_each_episode() -> None:
     assert torch.equal(drawn()[0][100:], force[100:])
 
 
-def test_pushes_grow_over_the_first_steps() -> None:
-    """After a quarter of the steps of `rise`, pushes have at most a quarter of the full force."""
+def test_pushes_and_latency_grow_over_the_first_steps() -> None:
+    """After a quarter of the steps of `rise`, pushes have at most a quarter of the full force, and
+    a latency of up to 2 steps is the whole part of a uniform number below 1 + 2 / 4: 0 or 1."""
     count = 50
-    physics, state = made("rocket_navigation", count, Disturbances(push=20.0, rise=4000))
-    for bound in (0.0, 5.0, 10.0, 15.0, 20.0, 20.0):
+    physics, state = made("rocket_navigation", count, Disturbances(push=20.0, rise=4000, latency=2))
+    for bound, latest in ((0.0, 0), (5.0, 1), (10.0, 1), (15.0, 2), (20.0, 2), (20.0, 2)):
         physics.begin(torch.arange(count), torch.ones(count, dtype=torch.bool))
         largest = float(physics.worlds.force.norm(dim=-1).max())
         assert 0.9 * bound <= largest <= bound + 1e-5
+        assert set(physics._latency.tolist()) == set(range(latest + 1))
         for _ in range(20):  # 1,000 environment steps
             state = physics.advance(state, torch.zeros(count, 2))
 

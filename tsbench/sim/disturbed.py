@@ -26,8 +26,9 @@ class Disturbances:
 
     Attributes:
         push: largest force of a push in newtons, on the task's pushed body, at any heading.
-        rise: environment steps over which the largest force grows linearly from zero to `push`. A
-            policy that is pushed over from the first step on learns nothing.
+        rise: environment steps over which pushes and latency grow linearly: the largest force from
+            zero to `push`, and the latency's range from none to `latency`. A policy that is pushed
+            over from the first step on learns nothing.
         calm: share of the episodes without a push, because scores start with the undisturbed task.
         interval: seconds from push to push. The first comes at random within one interval.
         duration: duration of a push in seconds.
@@ -35,7 +36,7 @@ class Disturbances:
         friction: the same for friction.
         strength: the same for the strength of the motors.
         latency: control steps at most by which actions come late; of each episode its own, all
-            numbers of steps equally likely. Actions of zero come before the first.
+            numbers of steps equally likely after the rise. Actions of zero come before the first.
     """
 
     push: float = 0.0
@@ -101,9 +102,8 @@ class DisturbedPhysics(Physics[S]):
         if self.disturbances.push:
             self._draw(rng, rows)
         if self.disturbances.latency:
-            self._latency[rows] = rng.integers(
-                0, self.disturbances.latency, len(rows), endpoint=True
-            )
+            most = 1.0 + self._level() * self.disturbances.latency
+            self._latency[rows] = rng.uniform(0.0, most, len(rows)).astype(int)
             self._actions[rows] = 0.0
         return super().begin(rng, rows)
 
@@ -125,14 +125,15 @@ class DisturbedPhysics(Physics[S]):
     def _draw(self, rng: Rng, rows: np.ndarray) -> None:
         shape = (len(rows), self._forces.shape[1])
         heading = rng.uniform(0.0, 2.0 * math.pi, shape)
-        size = rng.uniform(0.0, 1.0, shape) * self._strongest()
+        size = rng.uniform(0.0, 1.0, shape) * (self.disturbances.push * self._level())
         size *= rng.uniform(0.0, 1.0, (len(rows), 1)) >= self.disturbances.calm
         self._forces[rows] = size[..., None] * direction(self.plant, heading)
         self._first[rows] = rng.uniform(0.0, self.disturbances.interval, len(rows))
 
-    def _strongest(self) -> float:
+    def _level(self) -> float:
+        """Share of the rise that lies behind, in [0, 1]."""
         steps, rise = self.substeps / self.plant.substeps, self.disturbances.rise
-        return self.disturbances.push * (1.0 if steps >= rise else steps / rise)
+        return 1.0 if steps >= rise else steps / rise
 
     def snapshot(self) -> dict[str, Any]:
         return {

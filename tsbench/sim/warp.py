@@ -151,9 +151,10 @@ def _disturb(
         return
     episode[i] = episode[i] + 1
     rng = wp.rand_init(wp.randi(wp.rand_init(seed, i)), episode[i])
-    largest = strongest
+    level = 1.0
     if rise > 0.0:
-        largest = strongest * wp.min(float(steps[0]) / rise, 1.0)
+        level = wp.min(float(steps[0]) / rise, 1.0)
+    largest = strongest * level
     if wp.randf(rng) < calm:
         largest = 0.0
     for k in range(force.shape[1]):
@@ -162,7 +163,8 @@ def _disturb(
         force[i, k] = size * (wp.cos(heading) * axis1 + wp.sin(heading) * axis2)
     if strongest > 0.0:
         first[i] = wp.randf(rng) * interval[i]
-    latency[i] = wp.int64(wp.randi(rng, 0, latest + 1))
+    late = int(wp.randf(rng) * (1.0 + level * float(latest)))
+    latency[i] = wp.int64(wp.min(late, latest))
 
 
 @wp.kernel(enable_backward=False)
