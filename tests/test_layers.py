@@ -27,6 +27,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "methods": {"core", "sim", "planning", "rl"},
     "evaluation": {"core", "sim", "tasks"},
     "runs": {"core", "sim", "tasks", "rl", "methods", "evaluation"},
+    "leaderboard": {"core", "sim", "tasks", "evaluation", "runs"},
     "viewer": {"core", "sim", "tasks", "evaluation", "runs"},
     "bench": {"core", "sim", "tasks", "rl", "methods", "evaluation", "runs"},
 }

@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.core.errors import TsbenchError, os_errors, unknown
+from tsbench.core.errors import TsbenchError, quoted, unknown
+from tsbench.core.files import read_file
 from tsbench.core.policy import Policy
 from tsbench.core.task import MDP
 
 ONNX_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+MAX_FILE = 256 * 2**20  # bytes; with the state of its optimiser a model is thrice its network
 SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # those with continuous actions
 
 
@@ -32,12 +34,14 @@ class ForeignPolicy:
         observation_size: o.
         action_size: a.
         sha256: of the file it came from, or None.
+        model: of stable-baselines3, or None.
     """
 
     answer: Callable[[np.ndarray], Any]
     observation_size: int
     action_size: int
     sha256: str | None = None
+    model: Any = None
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Actions (n, a) for observations (n, o).
@@ -52,7 +56,9 @@ class ForeignPolicy:
         try:
             action = np.asarray(given, float)
         except (TypeError, ValueError):
-            raise TsbenchError(f"the policy's action is not made of numbers: {given!r}") from None
+            raise TsbenchError(
+                f"the policy's action is not made of numbers: {quoted(given)}"
+            ) from None
         if action.shape != (self.action_size,):
             raise TsbenchError(
                 f"the policy's action has shape {action.shape}, not ({self.action_size},)"
@@ -76,8 +82,8 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
         TsbenchError: onnxruntime is missing, or the file is damaged or of other sizes.
     """
     path = Path(path)
-    runtime = _extra("onnxruntime", "onnx")
-    content = _read(path)
+    runtime = extra("onnxruntime", "onnx")
+    content = read(path)
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1  # the order of sums is then the same everywhere
     try:
@@ -131,8 +137,8 @@ def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
     path = Path(path)
     if algorithm not in SB3_ALGORITHMS:
         raise unknown("stable-baselines3 algorithm", algorithm, SB3_ALGORITHMS)
-    baselines = _extra("stable_baselines3", "sb3")
-    content = _read(path)
+    baselines = extra("stable_baselines3", "sb3")
+    content = read(path)
     try:
         model = getattr(baselines, algorithm).load(path, device="cpu")
     except Exception as error:  # pickle, zipfile and torch raise anything
@@ -158,7 +164,7 @@ def from_sb3_model(
     def answer(observation: np.ndarray) -> Any:
         return model.predict(observation.astype(np.float32), deterministic=True)[0]
 
-    return ForeignPolicy(answer, mdp.observation_size, mdp.action_size, sha256)
+    return ForeignPolicy(answer, mdp.observation_size, mdp.action_size, sha256, model)
 
 
 def load(path: Path, mdp: MDP[Any], sb3: str | None = None) -> Policy | ForeignPolicy:
@@ -188,16 +194,25 @@ def load(path: Path, mdp: MDP[Any], sb3: str | None = None) -> Policy | ForeignP
     raise TsbenchError(f"{path} is neither a run directory nor an .onnx or .zip file")
 
 
-def _extra(package: str, extra: str) -> Any:
+def extra(package: str, extra: str) -> Any:
+    """A package that an extra of tsbench brings.
+
+    Raises:
+        TsbenchError: it is not installed.
+    """
     try:
         return importlib.import_module(package)
     except ImportError:
         raise TsbenchError(f"{package} is missing: pip install 'tsbench[{extra}]'") from None
 
 
-def _read(path: Path) -> bytes:
-    with os_errors(path):
-        return path.read_bytes()
+def read(path: Path) -> bytes:
+    """The content of a policy's file.
+
+    Raises:
+        TsbenchError: as `read_file`.
+    """
+    return read_file(path, MAX_FILE, "policy file")
 
 
 def _line(error: Exception) -> str:
