@@ -55,7 +55,7 @@ def test_an_entry_repeats(entry: Path) -> None:
     policy = RunDirectory(entry).policy()
     task = RunDirectory(entry).task(policy.info.task)
     score = RunDirectory(entry).record().score
-    log = RunDirectory(entry).actions()
+    log = RunDirectory(entry).actions(task)
     assert log is not None
     again = evaluate(policy, task, protocol=PROTOCOLS["smoke"], threads=1)
     then, now = score.origin, again.origin

@@ -4,8 +4,9 @@
     python tests/leaderboard/hostile.py runs        run directories, through the other verbs
     python tests/leaderboard/hostile.py fuzz N      N random changes of an entry's files
 
-Each case makes one line of JSON: its name, the reader's line, CPU seconds; the last line has the
-largest memory of the process. Nothing here judges: the tests do, and whoever runs it by hand.
+Each case makes one line of JSON: its name, whether it was accepted, the reader's line, CPU seconds,
+and the most memory that the process had meanwhile. Nothing here judges: the tests do, and whoever
+runs it by hand.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import hashlib
 import io
 import json
 import os
-import resource
 import shutil
 import signal
 import socket
@@ -596,8 +596,22 @@ def patience() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+def clear_peak() -> None:
+    """Lets the peak of this process's memory begin now, where Linux does that."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak() -> int:
+    """Megabytes of memory at most since `clear_peak`."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith("VmHWM"))
+    return int(line.split()[1]) // 1024
+
+
 def tell(case: str, line: Callable[[], tuple[bool, str]]) -> None:
     """Prints what became of a case: whether it was accepted, and the reader's line."""
+    clear_peak()
     began = time.process_time()
     try:
         with patience():
@@ -605,7 +619,7 @@ def tell(case: str, line: Callable[[], tuple[bool, str]]) -> None:
     except BaseException as error:  # whatever it is, it is a finding
         accepted, said = False, f"TRACEBACK {error!r:.200} {traceback.format_exc()[-600:]}"
     seconds = round(time.process_time() - began, 3)
-    found = {"case": case, "accepted": accepted, "line": said, "seconds": seconds}
+    found = {"case": case, "accepted": accepted, "line": said, "seconds": seconds, "MB": peak()}
     sys.stdout.write(json.dumps(found) + "\n")
     sys.stdout.flush()
 
@@ -718,8 +732,6 @@ def main() -> None:
         else:
             {"entries": entries, "runs": runs}[options.what](Path(folder))
         assert not list(Path(folder).rglob("pwned")), "code of an entry ran"
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    sys.stdout.write(json.dumps({"megabytes": round(memory)}) + "\n")
 
 
 if __name__ == "__main__":

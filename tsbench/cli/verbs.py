@@ -299,7 +299,7 @@ def _evaluate(words: Sequence[str]) -> int:
     if name not in PROTOCOLS:
         raise unknown("protocol", name, PROTOCOLS)
     protocol = PROTOCOLS[name]
-    log = run.actions() if kept else None
+    log = run.actions(task) if kept else None
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
     console, standard = Console(), tasks.standard(task)

@@ -135,10 +135,13 @@ def _content(path: Path, kind: str) -> dict[str, np.ndarray]:
                 raise ValueError(f"it holds {len(members)} arrays, at most {MAX_ARRAYS} may be")
             if sum(member.file_size for member in members) > MAX_UNPACKED:
                 raise ValueError(f"unpacked it is larger than {MAX_UNPACKED:,} bytes")
-            content = {
-                member.filename.removesuffix(".npy"): _array(_unpacked(file, member))
-                for member in members
-            }
+            content = {}
+            for member in members:
+                name = member.filename.removesuffix(".npy")
+                try:
+                    content[name] = _array(_unpacked(file, member))
+                except ValueError as error:
+                    raise ValueError(f"{quoted(name)}: {error}") from None
         if len(content) < len(members):
             raise ValueError("an array is there twice")
     except _DAMAGE as error:
@@ -161,12 +164,12 @@ def _array(data: bytes) -> np.ndarray:
     """
     stream = io.BytesIO(data)
     if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError("an array is of another version of the npy format")
+        raise ValueError("it is of another version of the npy format")
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     if dtype.kind not in _KINDS:
-        raise ValueError(f"an array is of type {quoted(str(dtype))}")
+        raise ValueError(f"it is of type {quoted(str(dtype))}")
     if math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
-        raise ValueError(f"the size of an array is not that of its shape {quoted(shape)}")
+        raise ValueError(f"its size is not that of its shape {quoted(shape)}")
     flat = np.frombuffer(data, dtype, offset=stream.tell())
     return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
 

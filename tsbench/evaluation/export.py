@@ -342,11 +342,11 @@ def _row(values: np.ndarray) -> np.ndarray:
 
 def _leaves(module: Any) -> Iterator[Any]:
     """The modules that a torch module is made of, in their order."""
-    inner = list(module.children())
-    if not inner:
+    inner, kind = list(module.children()), type(module).__name__
+    if not inner and kind != "Sequential":
         yield module
-    elif type(module).__name__ != "Sequential":
-        raise TsbenchError(f"it holds a {type(module).__name__}, whose order nobody knows")
+    elif kind != "Sequential":
+        raise TsbenchError(f"it holds a {kind}, whose order nobody knows")
     for one in inner:
         yield from _leaves(one)
 

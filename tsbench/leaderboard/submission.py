@@ -420,7 +420,7 @@ def _read_training(run: RunDirectory, training: Training, manifest: Manifest) ->
         )
     if wrong := contradictions(record.score, task):
         raise TsbenchError(f"{run.score_file} contradicts itself: {'; '.join(wrong)}")
-    log = run.actions()
+    log = run.actions(task)
     wanted = (task.horizon, 1 + origin.protocol.logged, task.action_size)
     if log is None or log.actions.shape != wanted:
         raise TsbenchError(f"{run.actions_file} does not hold the episodes of the protocol")

@@ -218,7 +218,7 @@ def _replay(kept: Kept, asked: Asked, findings: _Findings) -> tuple[bool, str]:
     here = Origin.here(kept.task, score.origin.protocol, kept.policy)
     if words := incomparable(score.origin, here):
         return False, f"was made with {words}"
-    log = kept.run.actions()
+    log = kept.run.actions(kept.task)
     assert log is not None
     if not replay(kept.task, score, log):
         return False, "earns other rewards with the kept actions"
@@ -226,7 +226,7 @@ def _replay(kept: Kept, asked: Asked, findings: _Findings) -> tuple[bool, str]:
 
 
 def _rescore(kept: Kept, asked: Asked, findings: _Findings) -> tuple[bool, str]:
-    before, log = kept.record.score, kept.run.actions()
+    before, log = kept.record.score, kept.run.actions(kept.task)
     protocol = before.origin.protocol
     again = evaluate(kept.policy, kept.task, protocol=protocol, threads=asked.threads)
     findings.verified[kept.training.seed] = again

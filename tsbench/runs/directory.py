@@ -220,9 +220,26 @@ class RunDirectory:
         """
         return _motion(ReferenceMotion, self.reference_file, task)
 
-    def actions(self) -> ActionLog | None:
-        """The run's action log, or None if it has none."""
-        return ActionLog.load(self.actions_file) if _there(self.actions_file) else None
+    def actions(self, task: Task[Any]) -> ActionLog | None:
+        """The run's action log, or None if it has none.
+
+        Raises:
+            TsbenchError: the file is damaged, or the log is another task's.
+        """
+        if not _there(self.actions_file):
+            return None
+        log = ActionLog.load(self.actions_file)
+        if (log.task, log.task_version) != (task.name, task.version):
+            raise TsbenchError(
+                f"{self.actions_file} is for {log.task} version {log.task_version}, "
+                f"not for {task.name} version {task.version}"
+            )
+        return log
+
+    @property
+    def has_metrics(self) -> bool:
+        """Whether the directory holds the metrics of the training."""
+        return _there(self.metrics_file)
 
 
 def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
