@@ -551,10 +551,10 @@ ABSENT = {  # whose absence is no fault
 }  # fmt: skip
 
 
-def run_cases(run: Path) -> Iterator[tuple[str, str, Change]]:
+def run_cases(verbs: list[str], contents: bool) -> Iterator[tuple[str, str, Change]]:
     """Verb, name, change."""
-    for verb, files in READ_BY.items():
-        for name in files:
+    for verb in verbs:
+        for name in READ_BY[verb]:
             for kind in KINDS:
                 if (kind.__name__, name) in ABSENT or (name, kind) == ("metrics.jsonl", empty):
                     continue
@@ -562,7 +562,7 @@ def run_cases(run: Path) -> Iterator[tuple[str, str, Change]]:
             bad: dict[str, dict[str, Any]] = {
                 "json": TEXTS, "yaml": YAMLS, "npz": NPZS, "safetensors": SAFETENSORS,
             }  # fmt: skip
-            for what, content in bad.get(name.rpartition(".")[2], {}).items():
+            for what, content in bad.get(name.rpartition(".")[2], {}).items() if contents else ():
                 if what in ("many keys", "a Python object") or verb in ("evaluate", "resume"):
                     yield verb, f"{verb} {name}: {what}", written(name, content)
 
@@ -644,10 +644,10 @@ def entries(folder: Path) -> None:
         shutil.rmtree(board, ignore_errors=True)
 
 
-def runs(folder: Path) -> None:
+def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> None:
     whole = intact(folder / "whole") / "seed0"
     (whole / "metrics.jsonl").write_text('{"stage": "plan", "steps": 1, "episode_return": 1.0}\n')
-    for verb, case, change in run_cases(whole):
+    for verb, case, change in run_cases([chosen] if chosen else [*READ_BY], only is None):
         out = Path(tempfile.mkdtemp(dir=folder))
         run = out / "a" / "b" / "run"
         shutil.copytree(whole, run)
@@ -723,14 +723,20 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=("entries", "runs", "fuzz"))
     parser.add_argument("count", nargs="?", type=int, default=300)
-    parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--start", type=int, default=0, help="of the random numbers")
+    parser.add_argument("--verb", choices=READ_BY, help="of the runs, one alone")
+    parser.add_argument(
+        "--only", choices=("kinds",), help="no content that a parser might choke on"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="hostile-") as folder:
         os.chdir(folder)
         if options.what == "fuzz":
             fuzz(Path(folder), options.count, options.start)
+        elif options.what == "runs":
+            runs(Path(folder), options.verb, options.only)
         else:
-            {"entries": entries, "runs": runs}[options.what](Path(folder))
+            entries(Path(folder))
         assert not list(Path(folder).rglob("pwned")), "code of an entry ran"
 
 

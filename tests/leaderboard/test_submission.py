@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
 from tsbench import tasks
@@ -496,6 +499,39 @@ def test_a_pull_request_that_changes_something_else(
     comment = Path("comment.md").read_text()
     assert "Not verified" in comment
     assert fault.replace("'", "&#39;") in comment
+
+
+def test_the_script_of_the_workflow(repository: str) -> None:
+    """As the workflow calls it, on an entry of the repository's own."""
+    run = min(BOARD.glob("v1/*/*/seed*"), key=lambda run: (run / "actions.npz").stat().st_size)
+    described = Described("theirs", ("A. Person",), "MIT")
+    board = Path("repo/leaderboards").absolute()
+    submission.place(submission.pack([run], described, board, V1, score=evaluate), board, V1, [])
+    git("checkout", "-q", "-b", "theirs", repository)
+    git("add", str(board / "v1" / RunDirectory(run).record().task / "theirs"))
+    git("commit", "-q", "-m", "theirs")
+    script = BOARD.parent / ".ci" / "verify_submission"
+    done = subprocess.run(
+        [script, "repo", repository, "comment.md", "--quick", "--threads", "1"],
+        env={**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(BOARD.parent)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "theirs: replayed, passed" in Path("comment.md").read_text()
+
+
+def test_the_workflow_that_sees_a_submission_has_no_rights() -> None:
+    folder = BOARD.parent / ".github" / "workflows"
+    verifies = yaml.safe_load((folder / "submission.yml").read_text())
+    assert verifies["permissions"] == {"contents": "read"}
+    assert "pull_request" in verifies[True]  # YAML reads the key `on` as true
+    text = (folder / "submission.yml").read_text()
+    assert "secrets." not in text
+    assert "pull_request_target" not in text
+    comments = yaml.safe_load((folder / "submission-comment.yml").read_text())
+    assert comments[True]["workflow_run"]["workflows"] == [verifies["name"]]
+    assert not any("uses" in step for step in comments["jobs"]["comment"]["steps"])
 
 
 def test_a_comment_is_nothing_but_text() -> None:

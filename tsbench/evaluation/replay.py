@@ -231,7 +231,7 @@ def _impossible(summary: Summary, episodes: int, task: Task[Any]) -> list[str]:
         found.append("normalized_reward is beyond 1")
     if summary.success == 0.0 and summary.solved_reward != 0.0:
         found.append("solved_reward without a solved episode")
-    if not set(summary.measures) <= set(task.measure_notes):
+    if set(summary.measures) != set(task.measure_notes):
         found.append("the measures are not the task's")
     return found
 

@@ -202,7 +202,12 @@ class RunDirectory:
         """The task of that name with the run's constants; without a configuration file, with the
         standard constants."""
         constants = self.config().task.constants if _there(self.config_file) else {}
-        return tasks.make(name, **constants)
+        try:
+            return tasks.make(name, **constants)
+        except TsbenchError as error:
+            if not constants:
+                raise
+            raise TsbenchError(f"{self.config_file}: {error}") from None
 
     def plan(self, task: Task[Any]) -> Plan | None:
         """The run's plan, or None if it has none.
@@ -282,7 +287,10 @@ def _motion(kind: type[M], path: Path, task: Task[Any]) -> M | None:
     if not _there(path):
         return None
     motion = kind.load(path)
-    plannable(task).check_fit(motion)
+    try:
+        plannable(task).check_fit(motion)
+    except TsbenchError as error:
+        raise TsbenchError(f"{path}: {error}") from None
     return motion
 
 
