@@ -527,7 +527,7 @@ def test_the_workflow_that_sees_a_submission_has_no_rights() -> None:
     assert verifies["permissions"] == {"contents": "read"}
     assert "pull_request" in verifies[True]  # YAML reads the key `on` as true
     text = (folder / "submission.yml").read_text()
-    assert "secrets." not in text
+    assert "${{ secrets" not in text
     assert "pull_request_target" not in text
     comments = yaml.safe_load((folder / "submission-comment.yml").read_text())
     assert comments[True]["workflow_run"]["workflows"] == [verifies["name"]]

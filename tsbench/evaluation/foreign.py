@@ -22,6 +22,10 @@ from tsbench.core.task import MDP
 
 ONNX_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 MAX_FILE = 256 * 2**20  # bytes; with the state of its optimiser a model is thrice its network
+REFUSED_OPERATORS = {
+    "Loop", "Scan", "If", "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",
+    "RandomUniform", "RandomUniformLike",
+}  # fmt: skip
 SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # those with continuous actions
 
 
@@ -76,7 +80,8 @@ def from_function(function: Callable[[np.ndarray], Any], mdp: MDP[Any]) -> Forei
 def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     """An ONNX model whose input is (1, o) or (n, o) and whose first output is the actions.
 
-    An ONNX file is data; it cannot run code of its own.
+    An ONNX file is data; it cannot run code of its own. One whose answers may depend on something
+    else than the file and the observation, or which may never answer, is refused.
 
     Raises:
         TsbenchError: onnxruntime is missing, or the file is damaged or of other sizes.
@@ -84,6 +89,7 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     path = Path(path)
     runtime = extra("onnxruntime", "onnx")
     content = read(path)
+    _check_graph(content, path)
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1  # the order of sums is then the same everywhere
     try:
@@ -123,6 +129,29 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     return ForeignPolicy(
         answer, mdp.observation_size, mdp.action_size, hashlib.sha256(content).hexdigest()
     )
+
+
+def _check_graph(content: bytes, path: Path) -> None:
+    """
+    Raises:
+        TsbenchError: the file keeps weights in another file, which onnxruntime would look for in
+            the current directory; or it holds loops or random numbers.
+    """
+    onnx = extra("onnx", "onnx")
+    try:
+        model = onnx.load_from_string(content)
+    except Exception as error:  # protobuf's own
+        raise TsbenchError(f"damaged ONNX file {path}: {_line(error)}") from None
+    nodes, tensors = [], list(model.graph.initializer)
+    for graph in (model.graph, *model.functions):
+        nodes += graph.node
+    for node in nodes:
+        if node.op_type in REFUSED_OPERATORS:
+            raise TsbenchError(f"{path} holds the operator {node.op_type}, which is not allowed")
+        tensors += [one.t for one in node.attribute if one.HasField("t")]
+    for tensor in tensors:
+        if tensor.data_location == onnx.TensorProto.EXTERNAL:
+            raise TsbenchError(f"{path} keeps weights in another file: save it as one file")
 
 
 def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
