@@ -54,7 +54,7 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
 
         def _foreign(self) -> str:
             """Why the request is another site's, or "" if it is none."""
-            names = [f"{name}:{server.server_port}" for name in (HOST, "localhost")]
+            names = [f"{name}:{listening.server_port}" for name in (HOST, "localhost")]
             if self.headers.get("Host") not in names:
                 return f"this server is {names[0]}"
             asker = self.headers.get("Sec-Fetch-Site", "none")
@@ -94,11 +94,11 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
             rendering.acquire()
 
     try:
-        server = Server((HOST, port), Handler)
+        listening = Server((HOST, port), Handler)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise TsbenchError(f"cannot listen on port {port}: {reason}") from None
-    return server
+    return listening
 
 
 def address(running: ThreadingHTTPServer, push: str | None) -> str:
