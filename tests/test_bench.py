@@ -13,20 +13,23 @@ import numpy as np
 import pytest
 
 from tsbench import bench, tasks
-from tsbench.bench import Comparison, Findings, stepping
+from tsbench.bench import Comparison, Findings, scaling, stepping, training
+from tsbench.bench.domains import domains, planned, richest
 from tsbench.bench.training import split
 from tsbench.bench.turns import Case, Effort, Range, take_turns
 from tsbench.cli.verbs import main
+from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import ReferenceMotion
+from tsbench.core.task import Plannable
 from tsbench.rl.settings import PPOSettings
 from tsbench.sim import gym, single
 from tsbench.sim.tracking import Imitation
 
 
-def outside(name: str) -> Any:
-    """A comparison's module of benchmarks/, imported and so registered."""
-    spec = spec_from_file_location(name, Path(__file__).parents[1] / "benchmarks" / f"{name}.py")
+def outside(name: str, folder: str = "benchmarks") -> Any:
+    """A module outside the package: a comparison, which is registered thereby, or another test."""
+    spec = spec_from_file_location(name, Path(__file__).parents[1] / folder / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
@@ -36,7 +39,9 @@ def outside(name: str) -> Any:
 
 
 sb3, envpool = outside("against_sb3"), outside("against_envpool")
+interfaces = outside("test_interfaces", "tests/tasks")
 TINY = Effort(repeats=2, seconds=0.01, count=6, counts=(1, 3), iterations=1, budget="smoke")
+ROBOT = max(domains())  # any robot
 PARTS = ("physics", "mdp", "inference", "update", "records")
 
 
@@ -68,15 +73,15 @@ def test_what_is_written_is_what_was_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "bench.json"
-    assert main(["bench", "--quick", "--only", "rocket", "--json", str(file)]) == 0
+    assert main(["bench", "--quick", "--only", ROBOT, "--json", str(file)]) == 0
     result = json.loads(file.read_text())
-    assert {"rocket.batched/rollout", "rocket.batched/async"} <= result["ratios"].keys()
+    assert {f"{ROBOT}.batched/rollout", f"{ROBOT}.batched/async"} <= result["ratios"].keys()
     for name, (least, most) in result["ranges"].items():
         assert least <= result["ratios"][name] <= most
-    assert result["figures"]["rocket.loop"]["unit"] == "steps/s"
+    assert result["figures"][f"{ROBOT}.loop"]["unit"] == "steps/s"
     assert result["machine"]["cores"] >= 1
     shown = capsys.readouterr().out
-    assert "rocket.batched/rollout" in shown
+    assert f"{ROBOT}.batched/rollout" in shown
     assert result["machine"]["mujoco"] in shown
 
 
@@ -89,8 +94,9 @@ def test_the_rival_is_given_our_settings(
     pytest.importorskip("stable_baselines3")
     logs = tmp_path / "logs"
     monkeypatch.setenv("SB3_LOGDIR", str(logs))
-    name = "rocket_navigation"
-    imitation = Imitation(tasks.make(name), naive_reference(name))
+    task = planned(domains()[ROBOT])
+    assert task is not None
+    imitation = Imitation(task, naive_reference(task.name))
     chosen = PPOSettings(
         environments=2, rollout=8, epochs=1, minibatches=2, hidden=(5, 4), activation="elu",
         encoding="symlog", desired_kl=None, learning_rate=1e-3, final_learning_rate=1e-5, repeat=3,
@@ -147,13 +153,49 @@ def test_a_missing_package_is_named_and_the_rest_goes_on(monkeypatch: pytest.Mon
     assert findings.figures == one.figures
 
 
+def test_the_measured_tasks_are_those_of_the_registry() -> None:
+    """Every task that tsbench brings has a comparison of its robot; nothing lists names."""
+    own = [name for name in tasks.names() if tasks.provider(name) == plugins.own()]
+    found = domains()
+    assert sorted(task.name for group in found.values() for task in group) == sorted(own)
+    assert found.keys() <= set(bench.names())
+    for group in found.values():
+        assert len({task.spec().modelname for task in group}) == 1
+        geoms = [task.spec().compile().ngeom for task in group]
+        assert richest(group) == group[geoms.index(max(geoms))]
+        with_plan = [task for task in group if isinstance(task, Plannable)]
+        assert planned(group) == (with_plan[0] if with_plan else None)
+
+
+def test_a_new_task_of_tsbench_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task of another robot, without a planning variant, brought by tsbench or by a plug-in."""
+    monkeypatch.setattr(tasks, "_factories", {})
+    monkeypatch.setattr(tasks, "provider", {"cart": plugins.own(), "sled": None}.get)
+
+    def cart() -> Any:
+        return interfaces.Cart()
+
+    tasks.register("cart")(cart)
+    tasks.register("sled")(cart)
+    ((robot, group),) = domains().items()
+    assert group == (interfaces.Cart(),)
+    assert planned(group) is None
+    assert training.compare(TINY).figures == {}
+    assert scaling.compare(TINY).figures.keys() >= {f"{robot}.environments_1"}
+    found = stepping.compare("cart", richest(group), TINY)
+    assert found.figures.keys() == {
+        f"cart.{case}" for case in ("rollout", "batched", "async", "loop")
+    }
+    assert found.ratios.keys() == {f"cart.batched/{case}" for case in ("rollout", "async", "loop")}
+
+
 def test_unknown_comparison_is_refused() -> None:
-    with pytest.raises(TsbenchError, match="did you mean 'rocket'"):
-        bench.measure("rockt")
+    with pytest.raises(TsbenchError, match=f"did you mean '{ROBOT}'"):
+        bench.measure(f"{ROBOT}s")
 
 
 def test_cases_say_how_many_steps_they_did() -> None:
-    task = tasks.make("laikago_trot")
+    task = richest(domains()[ROBOT])
     assert stepping.batched("batched", task, 6).steps() == 6
     assert stepping.rollout(task, 6).steps() == 6
     assert stepping.loop("loop", task).steps() == stepping.SINGLE_STEPS

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import tsbench
+from tsbench import methods, tasks
 
 ROOT = Path(tsbench.__file__).parent
 
@@ -117,6 +118,15 @@ def test_tasks_and_methods_do_not_know_their_like() -> None:
         assert len(files) >= 2
         for name in (package, *files):
             assert not ours(name) & files, name
+
+
+def test_nothing_lists_tasks_or_methods() -> None:
+    """Outside the file of a task or method no string of the package is its name."""
+    listed = {*tasks.names(), *methods.names()}
+    for name, tree in MODULES.items():
+        if room(name) not in ("tasks", "methods"):
+            strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
+            assert not strings & listed, name
 
 
 def test_heavy_packages_stay_in_their_rooms() -> None:

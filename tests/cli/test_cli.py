@@ -117,7 +117,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
         (["view", "nowhere", "--html", "x.html"], "no run directory nowhere"),
         (["view", "task=rocket_navigatoin"], "(did you mean 'rocket_navigation'?)"),
         (["view", TASK, "--push", "100N"], "cannot read the push '100N'"),
-        (["view", TASK, "--push", "9N@1s:+x"], "only what a policy executes can be pushed"),
+        (["view", TASK, "--push", "9N@1s:+x"], "a plan cannot be pushed"),
         (["view", TASK, "--port", "70000"], "must be a whole number from 0 to 65535"),
         (["view", "/dev/null"], "damaged plan file /dev/null"),
         (["view", TASK, "--html", "/proc/none/x"], "/proc/none/x: No such file"),

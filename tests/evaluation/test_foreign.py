@@ -223,7 +223,7 @@ def test_the_command_line(
     assert verbs.main(words) == 0
     shown = capsys.readouterr().out
     assert "protocol smoke" in shown
-    assert "not to be ranked: protocol smoke asks too little" in shown
+    assert "not ranked: protocol smoke plays too few episodes" in shown
     for wrong, message in (
         ([path], f"task=NAME is missing; allowed: {', '.join(tasks.names())}"),
         ([path, "task=rocket"], "unknown task 'rocket'"),

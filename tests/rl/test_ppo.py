@@ -22,7 +22,7 @@ from tsbench.rl.settings import PPOSettings
 from tsbench.rl.stages import StageSettings, learn_planning, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment
-from tsbench.sim.disturbed import Disturbances
+from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.episodes import play
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.physics import Physics
@@ -215,6 +215,18 @@ def test_going_on_with_another_reward() -> None:
     assert reports[0] == pytest.approx(0.25, abs=0.05)
     assert second.steps == 128
     assert bits(second.policy(task, "test")) != bits(first.policy(task, "test"))
+
+
+def test_going_on_under_other_disturbances() -> None:
+    """A critic that is told of more or less than the one before learns its normaliser anew."""
+    task = tasks.make("rocket_navigation", distance=3.0)
+    first = learner(subject=task)
+    first.learn(128)
+    physics = DisturbedPhysics(task, 8, Disturbances(latency=1), 0, threads=1)
+    second = Learner(BatchedEnvironment(task, physics, 8, 0), TINY, 0, first)
+    assert bits(second.policy(task, "test")) == bits(first.policy(task, "test"))
+    second.learn(128)
+    assert second.steps == 128
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

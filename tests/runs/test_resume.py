@@ -205,7 +205,7 @@ def test_the_learner_goes_on_to_the_last_bit(
         "disturbances": trot,
     }
     disturb = Disturbances(
-        push=80.0, rise=400, calm=0.2, interval=0.3, mass=0.2, friction=0.3, strength=0.1
+        push=80.0, rise=400, calm=0.2, interval=0.3, mass=0.2, friction=0.3, strength=0.1, latency=2
     )
     chosen = PPOSettings(
         environments=8, rollout=16, epochs=2, minibatches=2, hidden=(16,), entropy=0.01,

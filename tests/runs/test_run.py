@@ -233,7 +233,7 @@ def test_another_physics_is_played_beside(
     words = ["evaluate", "one", "--physics", "half_step", "--json", "two.json"]
     assert cli.main(words) == 0
     shown = capsys.readouterr().out
-    assert "verdicts that flip in physics half_step" in shown
+    assert "verdicts that change in physics half_step" in shown
     assert "compared bit for bit: equal" in shown  # the certified score
     content = json.loads(Path("two.json").read_text())
     score = plain(RunDirectory(finished).record().score.as_dict())

@@ -136,6 +136,48 @@ def test_every_environment_has_its_own_physics_for_good() -> None:
     mass = (0.02 * 50.0 - gained[0] * 0.02 * 2.5) / (gained[0] + 0.02 * 2.5)
     assert len(np.unique(mass)) == 8
     assert np.all((mass > 0.7 * 5.0) & (mass < 1.3 * 5.0))
+    factors, friction, strength = physics.unseen()  # no latency
+    np.testing.assert_allclose(mass, 5.0 * factors, rtol=1e-9)
+    assert np.all(friction == 1.0)
+    assert np.all(strength == 1.0)
+
+
+def test_actions_come_late_by_what_a_critic_is_told() -> None:
+    """Rockets whose main engine is on from the first action on: one falls until it burns."""
+    task = tasks.make("rocket_navigation")
+    rows, full = np.arange(60), np.tile([1.0, 0.0], (60, 1))
+    physics = DisturbedPhysics(task, 60, Disturbances(latency=2), 0, threads=1)
+    batch = BatchedEnvironment(task, physics, 60, 0)
+    batch.reset()
+    (late,) = physics.unseen()
+    assert set(late) == {0, 1, 2}
+    np.testing.assert_array_equal(batch.value_observation()[:, -1], late)
+    np.testing.assert_array_equal(
+        batch.value_observation()[:, :-1], task.value_observation(batch.state)
+    )
+    climbs = []
+    for _ in range(3):
+        before = batch.state.velocity[:, 1]
+        batch.step(full)
+        climbs.append(batch.state.velocity[:, 1] > before)
+    np.testing.assert_array_equal(np.argmax(climbs, axis=0), late)
+    drawn = []
+    for seed in range(3):  # of each episode its own
+        physics.begin(np.random.default_rng(seed), rows)
+        drawn.append(physics.unseen()[0].tolist())
+    assert drawn[0] != drawn[1] != drawn[2]
+
+
+def test_a_critic_sees_what_the_mdp_says_where_nothing_is_hidden() -> None:
+    task = tasks.make("rocket_navigation")
+    for physics in (
+        Physics(task, 3, threads=1),
+        DisturbedPhysics(task, 3, Disturbances(push=20.0), 0, threads=1),
+    ):
+        batch = BatchedEnvironment(task, physics, 3, 0)
+        batch.reset()
+        expected = task.value_observation(batch.state)
+        np.testing.assert_array_equal(batch.value_observation(), expected)
 
 
 @pytest.mark.parametrize(

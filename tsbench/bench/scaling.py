@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import os
 
-from tsbench import tasks
 from tsbench.bench import Findings, comparison
+from tsbench.bench.domains import domains, richest
 from tsbench.bench.stepping import batched
 from tsbench.bench.turns import Effort, take_turns
-
-DOMAINS = {"laikago": "laikago_trot", "rocket": "rocket_obstacles"}
 
 
 @comparison("scaling")
 def compare(effort: Effort) -> Findings:
     """Rates by number of environments and by number of threads, and ratios to the smallest."""
     findings = Findings()
-    for domain, name in DOMAINS.items():
-        task = tasks.make(name)
+    for domain, group in domains().items():
+        task = richest(group)
         by_environments = [batched(f"environments_{n}", task, n) for n in effort.counts]
         by_threads = [
             batched(f"threads_{n}", task, effort.count, threads=n)

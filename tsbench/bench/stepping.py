@@ -1,6 +1,7 @@
 """The batched environment against bare physics, a plain loop and Gymnasium's AsyncVectorEnv.
 
-All cases make control steps of the same task with the same kind of random actions:
+Each robot has a comparison, under the name of its MJCF. All of its cases make control steps of the
+same task with the same kind of random actions:
 
 * `rollout`: bare `mujoco.rollout` over states and controls recorded from the batched environment.
   It computes states only: no sensors of the new state, no MDP, no resets. It is the upper limit.
@@ -9,12 +10,15 @@ All cases make control steps of the same task with the same kind of random actio
 * `async`: Gymnasium's AsyncVectorEnv, with one process for each environment.
 * `planning`: the batched planning variant, whose steps are kinematic.
 * `planning_ik`: the planning variant's dm_control environment, where mink solves for full poses.
+
+A task without a planning variant has no planning cases.
 """
 
 from __future__ import annotations
 
 import itertools
 import os
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -22,10 +26,10 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv
 from mujoco.rollout import Rollout
 
-from tsbench import tasks
 from tsbench.bench import Findings, comparison
+from tsbench.bench.domains import domains, richest
 from tsbench.bench.turns import Case, Effort, take_turns
-from tsbench.core.task import MDP, Task
+from tsbench.core.task import MDP, Plannable, Task
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.gym import GymEnvironment
 from tsbench.sim.kinematic import Planning
@@ -46,31 +50,27 @@ RATIOS = (
 )
 
 
-@comparison("laikago")
-def laikago(effort: Effort) -> Findings:
-    return compare("laikago", tasks.make("laikago_trot"), effort)
-
-
-@comparison("rocket")
-def rocket(effort: Effort) -> Findings:
-    return compare("rocket", tasks.make("rocket_obstacles"), effort)
-
-
 def compare(domain: str, task: Task[Any], effort: Effort) -> Findings:
-    variant: Planning[Any] = Planning(task)
+    """The rate of every case and the ratios of cases, under names that begin with the domain's."""
     cases = [
         rollout(task, effort.count),
         batched("batched", task, effort.count),
         asynchronous(task),
         loop("loop", task),
-        batched("planning", variant, effort.count),
-        loop("planning_ik", variant),
     ]
+    if isinstance(task, Plannable):
+        variant: Planning[Any] = Planning(task)
+        cases += [batched("planning", variant, effort.count), loop("planning_ik", variant)]
     rates = take_turns(cases, effort)
+    ratios = [pair for pair in RATIOS if rates.turns.keys() >= set(pair)]
     return Findings(
         figures={f"{domain}.{case.name}": rates.range(case.name) for case in cases},
-        ratios={f"{domain}.{over}/{under}": rates.ratio(over, under) for over, under in RATIOS},
+        ratios={f"{domain}.{over}/{under}": rates.ratio(over, under) for over, under in ratios},
     )
+
+
+for _domain, _group in domains().items():
+    comparison(_domain)(partial(compare, _domain, richest(_group)))
 
 
 def batched(

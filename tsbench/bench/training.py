@@ -1,7 +1,8 @@
 """The shares of a training's time: physics, MDP math, network inference, update, records.
 
 The planning and the imitation stage run as in `tsbench run budget=fast`, with records in files, but
-for fewer iterations. The imitation follows the plan of the hand-made planner.
+for fewer iterations. The imitation follows the plan of the hand-made planner. Each robot's first
+task with a planning variant is trained.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from tsbench.bench import Findings, comparison
+from tsbench.bench.domains import domains, planned
 from tsbench.bench.turns import Effort, Range
 from tsbench.core.method import Problem
 from tsbench.core.task import plannable
@@ -25,19 +27,19 @@ from tsbench.runs.workspace import RunWorkspace
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.tracking import Imitation
 
-TASKS = ("laikago_trot", "rocket_navigation")
-
 
 @comparison("training")
 def compare(effort: Effort) -> Findings:
     findings = Findings()
-    for name in TASKS:
-        problem = prepare(compose([f"task={name}"]))
+    for group in domains().values():
+        if (task := planned(group)) is None:
+            continue
+        problem = prepare(compose([f"task={task.name}"]))
         for stage in ("plan", "imitate"):
             chosen = settings(problem, stage)
             steps = chosen.steps
             rows = train(problem, stage, steps * (effort.iterations + 1))
-            findings.add(split(f"{name}.{stage}", rows, steps))
+            findings.add(split(f"{task.name}.{stage}", rows, steps))
     return findings
 
 

@@ -1,4 +1,4 @@
-"""Results as the user sees them."""
+"""The tables and lines that show results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HEADLINES = ("solved_reward", "normalized_reward", "against_plan")
 
 
 def score_table(title: str, score: Score, task: Task[Any]) -> Table:
-    """A score: perturbed starts beside the task's own, changed physics, and pushes."""
+    """The table of a score: perturbed starts, the task's own start, changed physics and pushes."""
     perturbed = score.perturbed
     table = Table(
         title=escape(title),
@@ -43,16 +43,16 @@ def score_table(title: str, score: Score, task: Task[Any]) -> Table:
         solved = f"{counts(change)[0]} of {change.episodes}"
         table.add_row(name, solved, number(change.normalized_reward))
     table.add_section()
-    table.add_row("pushes", "survived", "and solved", style="bold")
+    table.add_row("pushes", "survived", "task solved", style="bold")
     for label, survived, recovered in push_rows(score):
         table.add_row(label, survived, recovered)
     return table
 
 
 def flips_table(physics: str, found: Sequence[Flips]) -> Table:
-    """How many verdicts are others in another physics."""
+    """The numbers of verdicts that change in other physics."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column(f"verdicts that flip in physics {physics}")
+    table.add_column(f"verdicts that change in physics {physics}")
     table.add_column("flipped", justify="right")
     table.add_column("share", justify="right")
     for one in found:
@@ -61,7 +61,7 @@ def flips_table(physics: str, found: Sequence[Flips]) -> Table:
 
 
 def show_run(console: Console, record: Record, task: Task[Any]) -> None:
-    """Prints what ends a run: its score and what each stage cost."""
+    """Prints the score of a finished run and the cost of each stage."""
     table = score_table(record.title, record.score, task)
     table.add_section()
     table.add_row("stage", "steps", "time", style="bold")
@@ -72,18 +72,18 @@ def show_run(console: Console, record: Record, task: Task[Any]) -> None:
 
 
 def show_places(console: Console, run: RunDirectory) -> None:
-    """Prints where to look at a finished run next."""
-    for what, where in (
-        ("what came out", run.report_file),
-        ("score it again", f"tsbench evaluate {run.path}"),
+    """Prints the report's path and the command that makes the score again."""
+    for label, place in (
+        ("report", run.report_file),
+        ("score again", f"tsbench evaluate {run.path}"),
     ):
-        console.print(f" {what:<17} {where}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f" {label:<12} {place}", markup=False, highlight=False, soft_wrap=True)
 
 
 def show_rank(console: Console, standard: bool, score: Score) -> None:
-    """Says why a score cannot be ranked with others, where it cannot."""
+    """Prints why a score is not ranked, if so."""
     reasons = [] if standard else ["the task's constants were changed"]
     if not score.origin.protocol.ranked:
-        reasons.append(f"protocol {score.protocol} asks too little")
+        reasons.append(f"protocol {score.protocol} plays too few episodes")
     if reasons:
-        console.print(f" not to be ranked: {' and '.join(reasons)}", highlight=False)
+        console.print(f" not ranked: {' and '.join(reasons)}", highlight=False)

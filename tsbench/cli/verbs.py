@@ -23,22 +23,23 @@ from tsbench.gl import find_working_backend
 RUN_HELP = """\
 usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
 
-Trains a policy, evaluates it on the original task and leaves a run directory that explains itself.
+Trains a policy, evaluates it on the task and writes a run directory with a report.
 
 words, in Hydra's grammar:
-  task=NAME        what to solve; `tsbench list` names them
-  method=NAME      what solves it (twostage)
+  task=NAME        the task; `tsbench list` names all
+  method=NAME      the method (twostage)
   budget=NAME      smoke: seconds, fast: the standard, paper: the published one (fast)
-  seed=N           everything random comes from it (0)
+  seed=N           the seed of all random numbers (0)
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
-  resume=RUN       goes on with an interrupted run, to the same bits; alone, without other words
+  resume=RUN       continues an interrupted run to the same result, bit for bit; takes no other
+                   words
   method.KEY=...   an option of the method
   task.training.STAGE.KEY=...
                    a PPO setting of the plan, imitate, finetune or task stages
   task.constants.KEY=...
-                   a constant of the task, for studies: such a score cannot be ranked
+                   a constant of the task, for studies: such a score is not ranked
 
 options:
   --cfg job        show the configuration and stop
@@ -269,16 +270,24 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="POLICY_OR_RUN",
         help="directory with a policy in it, .onnx file, stable-baselines3 .zip, zero or random",
     )
-    parser.add_argument("task", nargs="?", metavar="task=NAME", help="where the policy says none")
+    parser.add_argument(
+        "task", nargs="?", metavar="task=NAME", help="for a policy that names no task"
+    )
     parser.add_argument(
         "--protocol",
         metavar="NAME",
-        help="v1 or smoke, which takes seconds (as the run was scored, else v1)",
+        help="v1, or smoke, which takes seconds (the protocol of the run's score, else v1)",
     )
-    help_physics = "elliptic or half_step: play it there too, and count the verdicts that flip"
+    help_physics = (
+        "elliptic or half_step: also play the protocol there and count the changed verdicts"
+    )
     parser.add_argument("--physics", metavar="NAME", help=help_physics)
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
-    parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
+    parser.add_argument(
+        "--trust-sb3",
+        metavar="ALGORITHM",
+        help="the algorithm that saved the .zip, which can run any code when it is loaded",
+    )
     options = parser.parse_args(words)
     from tsbench import tasks
     from tsbench.cli import tables
@@ -330,8 +339,8 @@ def _evaluate(words: Sequence[str]) -> int:
         flipped = flips(score, other)
         console.print(tables.flips_table(options.physics, flipped))
         console.print(
-            f" solved_reward {number(other.solved_reward)} in physics {options.physics}, "
-            f"{number(score.solved_reward)} certified; the first is never ranked or kept",
+            f" solved_reward: {number(score.solved_reward)} by protocol {protocol.name}, "
+            f"{number(other.solved_reward)} in physics {options.physics}, which is never ranked",
             highlight=False,
             soft_wrap=True,
         )
@@ -454,7 +463,7 @@ def _port(word: str) -> int:
 def _report(words: Sequence[str]) -> None:
     parser = _parser("report", json=False)
     parser.add_argument("run", type=Path, metavar="RUN", help="a finished run's directory")
-    what = "the page to write, a new one (what RUN lacks of its report.html and view.html)"
+    what = "the new page (the missing ones of report.html and view.html in RUN)"
     parser.add_argument("--html", type=Path, metavar="FILE", help=what)
     options = parser.parse_args(words)
     from tsbench.core.files import check_new, write_new
@@ -475,7 +484,7 @@ def _report(words: Sequence[str]) -> None:
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
     parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
-    parser.add_argument("--quick", action="store_true", help="a minute, with larger ranges")
+    parser.add_argument("--quick", action="store_true", help="a minute, with wider ranges")
     options = parser.parse_args(words)
     from tsbench import bench
     from tsbench.bench import table
@@ -694,12 +703,12 @@ def _seeds(word: str) -> list[int]:
 
 VERBS = {
     "run": Verb("train a policy and evaluate it", _run),
-    "evaluate": Verb("score a policy by the protocol, from its file alone", _evaluate),
-    "view": Verb("see a run, a plan or a task move: live, as a page or as a video", _view),
-    "report": Verb("write one page about a run: what was planned, done and learned", _report),
+    "evaluate": Verb("score a policy by a protocol", _evaluate),
+    "view": Verb("show a run, a plan or a task in motion: live, as a page or as a video", _view),
+    "report": Verb("write one page about a run: plan, motion, score and learning", _report),
     "export": Verb("write a policy of another library as tsbench's own file", _export),
     "submit": Verb("pack runs into an entry of the leaderboard", _submit),
-    "verify": Verb("find out whether entries of the leaderboard hold what they claim", _verify),
-    "bench": Verb("measure how fast it is, side by side with others", _bench),
+    "verify": Verb("check whether entries of the leaderboard hold what they claim", _verify),
+    "bench": Verb("measure speed, beside alternatives", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }

@@ -50,7 +50,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class State(Batch):
-    """What a task knows at one time step.
+    """The state of a task at one time step.
 
     Attributes:
         time: seconds since the start of the episode, shape (...,).
@@ -64,7 +64,7 @@ S = TypeVar("S", bound=State)
 
 @dataclass(frozen=True)
 class Course(Batch):
-    """What an episode has been through, as far as its last state does not tell.
+    """The history of an episode that its last state does not tell.
 
     Attributes:
         violated: whether anything was violated on the way, shape (...,).
@@ -81,7 +81,7 @@ class Start:
         time: seconds, shape (n,). Zero, except in training that starts along a reference motion.
         qpos: generalised positions, shape (n, nq).
         qvel: generalised velocities, shape (n, nv).
-        memory: what `Plant.control` remembers, shape (n, m).
+        memory: the memory of `Plant.control`, shape (n, m).
     """
 
     time: np.ndarray

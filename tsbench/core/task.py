@@ -4,8 +4,8 @@ Four interfaces, each of which adds to the one before:
 
 - `MDP`: observations, rewards and endings as functions of states, independent of the dynamics.
 - `SimulatedTask`: an MDP that is stepped in full physics, by the `Plant` that it names.
-- `Task`: that can be scored: what success is, what else to measure, when to push, which motion is
-  the best known.
+- `Task`: a simulated task that can be scored. It defines success, further measures, the instants of
+  pushes, and the best motion known.
 - `Plannable`: with a planning variant (`Abstraction`) and an imitation variant (`Tracker`).
 
 A new task is one class that implements `Task` or `Plannable`. Everything here is pure functions
@@ -85,8 +85,7 @@ class MDP(ABC, Generic[S]):
         return state.time < 0.0
 
     def violated(self, state: S) -> Array:
-        """Whether something happened that spoils the episode for good (a fall, a collision),
-        shape (...,)."""
+        """Whether this state spoils the episode for good (a fall, a collision), shape (...,)."""
         return state.time < 0.0
 
     def begun(self, state: S) -> Course:
@@ -97,33 +96,34 @@ class MDP(ABC, Generic[S]):
         """The course after the step from `previous` to `state`."""
         return course.replace(violated=course.violated | self.violated(state))
 
-    # Arriving: the one rule that scores and learners share. An episode that ends at its goal,
-    # with nothing violated on the way, is credited for the steps that it spares: else hovering
-    # just outside the goal would earn more than arriving.
+    # Arriving: one rule for scores and learners. An episode that ends at its goal without a
+    # violation is credited for the steps that it spares. Without this credit, hovering just outside
+    # the goal would earn more than arriving.
 
     def spared(self, state: S, course: Course) -> Array:
-        """Steps that an episode which ends in this state does not need, since it has arrived;
-        integers, zero unless it has, shape (...,).
+        """The number of steps that an arrival leaves of the horizon, zero for an episode that has
+        not arrived; integers, shape (...,).
 
         Args:
-            state: that the episode ended in, for a reason other than its last step.
-            course: that led there.
+            state: the state in which the episode ended, for a reason other than its last step.
+            course: the course of the episode.
         """
         xp = array_namespace(state.time)
         arrived = self.reached(state) & ~course.violated
         return xp.where(arrived, self.horizon - step_of(state.time, self.timestep), 0)
 
     def quality(self, course: Course) -> Array:
-        """What a spared step is worth beside a perfect one, in [0, 1], shape (...,): how well the
-        episode did on its way what the task asks for beside arriving."""
+        """The worth of a spared step as a share of a perfect step, in [0, 1], shape (...,). It says
+        how well the episode met the task's demands on the way, such as the footfall; by default
+        1."""
         return 1.0 - 0.0 * course.violated
 
     def credit(self, spared: Array, quality: Array, discount: float = 1.0) -> Array:
-        """What spared steps earn.
+        """The reward of spared steps, shape (...,).
 
         Args:
-            spared: steps, floating-point numbers, shape (...,).
-            quality: what each is worth beside a perfect one, shape (...,).
+            spared: numbers of steps as floating-point numbers, shape (...,).
+            quality: worth of each step as a share of a perfect step, shape (...,).
             discount: gamma per time step; the first spared step is discounted once.
         """
         if discount != 1.0:
@@ -192,7 +192,7 @@ class Task(SimulatedTask[S], Plant[S]):
     """A task that can be scored. It is its own plant.
 
     Attributes:
-        measure_notes: what each of `measures` says, in words, by its name.
+        measure_notes: the meaning of each of `measures` in words, by name.
     """
 
     measure_notes: Mapping[str, str] = MappingProxyType({})
@@ -203,34 +203,34 @@ class Task(SimulatedTask[S], Plant[S]):
 
     @property
     def mishap(self) -> str:
-        """What a violation is, in words that follow "without": "a fall"."""
+        """A violation in words that follow "without", such as "a fall"."""
         return "a violation"
 
     @abstractmethod
     def success(self, state: S, course: Course) -> Array:
         """Whether an episode that ended in `state` after this course is solved, shape (...,)."""
 
-    # Measures: what an episode did, in figures that mean something by themselves.
+    # Measures: figures of an episode with a meaning and unit of their own.
 
     def measured(self, previous: S, action: Array | None, state: S) -> dict[str, Array]:
-        """What a step adds to sums over the episode that `measures` needs, by name, each of shape
-        (...,); by default nothing. `action` is None where nothing acted, as along a plan: what
-        needs one is then left out."""
+        """The terms that a step adds to the episode's sums for `measures`, by name, each of shape
+        (...,); by default none. `action` is None for a plan; terms that need an action are then
+        left out."""
         return {}
 
     def measures(
         self, first: S, last: S, course: Course, sums: Mapping[str, Array], steps: Array
     ) -> dict[str, Array]:
-        """What there is to say of finished episodes beside their reward: figures by name, with the
-        unit in the name, what matters most first; not a number where an episode has none. By
-        default there are none.
+        """Figures of finished episodes beside their reward, by name, the main ones first. A name
+        includes the unit. A figure is not a number for an episode without it. By default there are
+        none.
 
         Args:
-            first: the state that the episode began in.
-            last: the state that it ended in.
-            course: that led there.
-            sums: of what its steps `measured`.
-            steps: that it took, shape (...,).
+            first: the state in which the episode began.
+            last: the state in which the episode ended.
+            course: the course of the episode.
+            sums: the sums of the terms that its steps `measured`.
+            steps: the number of its steps, shape (...,).
 
         Returns:
             Each of shape (...,).

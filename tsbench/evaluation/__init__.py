@@ -1,1 +1,1 @@
-"""What a policy is worth. Sees a policy as a function and nothing of how it came about."""
+"""Scores of policies. To this room a policy is a function; its training is unknown here."""

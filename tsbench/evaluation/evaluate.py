@@ -1,4 +1,4 @@
-"""How a policy is scored, by a protocol."""
+"""Scores a policy by a protocol."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def evaluate(
     """Scores a policy.
 
     Args:
-        policy: of the task.
-        task: with the constants that it is scored under.
-        protocol: that says how.
-        threads: for the physics, None for all cores; they change nothing but the time.
-        progress: is told now and then which share is done, up to 1.
+        policy: a function from observations of the task to actions.
+        task: the task, with the constants under which the policy is scored.
+        protocol: the protocol of the score.
+        threads: of the physics, None for all cores. Their number changes only the time taken.
+        progress: called now and then with the share that is done, up to 1.
 
     Raises:
         TsbenchError: the policy was trained for another task, version or physics.
@@ -93,8 +93,8 @@ def solved_rewards(
 def _watched(
     policy: PolicyFunction, task: Task[Any], protocol: Protocol, progress: Callable[[float], None]
 ) -> PolicyFunction:
-    """The policy, telling how many of all observations it has answered. Episodes that end early
-    make it jump."""
+    """The same policy, which also reports the share of all observations that it has answered. An
+    episode that ends early makes the share jump."""
     phases = np.array(task.push_steps[:: protocol.phases])
     pushes = len(protocol.forces) * protocol.headings * int((task.horizon - phases).sum())
     episodes = 2 + protocol.perturbed + len(protocol.conditions) * protocol.changed
@@ -114,7 +114,8 @@ def _logged(nominal: np.ndarray, perturbed: np.ndarray, protocol: Protocol) -> n
 
 
 def check_fit(policy: Policy, task: Task[Any]) -> None:
-    """
+    """Checks that a policy was trained for this task.
+
     Raises:
         TsbenchError: the policy was trained for another task, version or physics, or is of other
             sizes.

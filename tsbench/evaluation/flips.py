@@ -1,4 +1,4 @@
-"""How many verdicts of a score hang on the physics: the same protocol, played in another."""
+"""Counts the verdicts of a score that change when the protocol is played in other physics."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tsbench.evaluation.score import Score
 @dataclass(frozen=True)
 class Flips:
     """Attributes:
-    verdict: what was judged, and of what: "solved, perturbed starts".
-    flipped: how many of the verdicts are another in the other physics.
-    verdicts: how many there are.
-    share: flipped of them.
+    verdict: the kind of verdict and the judged episodes, such as "solved, perturbed starts".
+    flipped: number of verdicts that differ between the two physics.
+    verdicts: number of verdicts of this kind.
+    share: flipped / verdicts.
     """
 
     verdict: str
@@ -25,11 +25,12 @@ class Flips:
 
 
 def flips(certified: Score, other: Score) -> tuple[Flips, ...]:
-    """The verdicts that differ, episode by episode and push by push.
+    """Counts the verdicts that differ, episode by episode and push by push.
 
     Args:
-        certified: a score by a protocol.
-        other: the same policy's by that protocol in another physics (`Protocol.elsewhere`).
+        certified: the score of a policy by a protocol.
+        other: the score of the same policy by the same protocol in other physics
+            (`Protocol.elsewhere`).
     """
     first, second = _verdicts(certified), _verdicts(other)
     return tuple(

@@ -1,7 +1,7 @@
-"""Policies that were not made here, as what the evaluation asks for.
+"""Policies that tsbench did not train: functions, ONNX models and stable-baselines3 models.
 
-Each observation is answered by itself, whatever else is evaluated beside it: a network that sees
-many rows at once rounds differently, and an action must depend on its own observation alone.
+A foreign policy gets one observation at a time. A network that gets many rows at once rounds
+differently, and an action must depend on its own observation alone.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ REFUSED_OPERATORS = {
     "Loop", "Scan", "If", "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",
     "RandomUniform", "RandomUniformLike",
 }  # fmt: skip
-SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # those with continuous actions
+SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # the algorithms with continuous actions
 
 
 @dataclass(frozen=True)
 class ForeignPolicy:
-    """Any function of an observation.
+    """A policy made from any function of one observation.
 
     Attributes:
-        answer: observation (o,) -> action (a,).
+        answer: the function, from an observation (o,) to an action (a,).
         observation_size: o.
         action_size: a.
-        sha256: of the file it came from, or None.
-        model: of stable-baselines3, or None.
+        sha256: hash of the policy's file, or None for a policy without a file.
+        model: the model of stable-baselines3, or None.
     """
 
     answer: Callable[[np.ndarray], Any]
@@ -73,32 +73,35 @@ class ForeignPolicy:
 
 
 def from_function(function: Callable[[np.ndarray], Any], mdp: MDP[Any]) -> ForeignPolicy:
-    """A function of one observation (o,) that returns one action (a,), each in [-1, 1]."""
+    """A policy from a function of one observation (o,) that returns one action (a,).
+
+    Each component of an action lies in [-1, 1].
+    """
     return ForeignPolicy(function, mdp.observation_size, mdp.action_size)
 
 
 def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
-    """An ONNX model whose input is (1, o) or (n, o) and whose first output is the actions.
+    """A policy from an ONNX model with one input, (1, o) or (n, o). Its first output is the action.
 
     An ONNX file is data; it cannot run code of its own. One whose answers may depend on something
     else than the file and the observation, or which may never answer, is refused.
 
     Raises:
-        TsbenchError: onnxruntime is missing, or the file is damaged or of other sizes.
+        TsbenchError: onnxruntime is missing, the file is damaged, or its sizes do not fit the task.
     """
     path = Path(path)
     runtime = extra("onnxruntime", "onnx")
     content = read(path)
     _check_graph(content, path)
     options = runtime.SessionOptions()
-    options.intra_op_num_threads = 1  # the order of sums is then the same everywhere
+    options.intra_op_num_threads = 1  # more threads would sum in another order
     try:
         session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own exceptions share no base class
         raise TsbenchError(f"damaged ONNX file {path}: {_line(error)}") from None
     inputs = session.get_inputs()
     size = mdp.observation_size
-    # The number of rows is 1, or not fixed: a name or nothing.
+    # The number of rows is 1 or not fixed. ONNX writes a size that is not fixed as a name or None.
     fitting = [
         one
         for one in inputs
@@ -155,13 +158,13 @@ def _check_graph(content: bytes, path: Path) -> None:
 
 
 def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
-    """A model that stable-baselines3 saved, acting deterministically.
+    """A policy from a file that stable-baselines3 saved. It acts deterministically.
 
-    Such a file can run any code when it is loaded: only load files of people you trust.
+    Such a file can run any code when it is loaded. Load only files of people you trust.
 
     Raises:
-        TsbenchError: stable-baselines3 is missing, there is no such algorithm, or the file is
-            damaged or of other sizes.
+        TsbenchError: stable-baselines3 is missing or has no such algorithm, the file is damaged,
+            or its sizes do not fit the task.
     """
     path = Path(path)
     if algorithm not in SB3_ALGORITHMS:
@@ -178,10 +181,10 @@ def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
 def from_sb3_model(
     model: Any, mdp: MDP[Any], name: str = "the model", sha256: str | None = None
 ) -> ForeignPolicy:
-    """A stable-baselines3 model that is there already, acting deterministically.
+    """A policy from a loaded stable-baselines3 model. It acts deterministically.
 
     Raises:
-        TsbenchError: it is of other sizes.
+        TsbenchError: the model's sizes do not fit the task.
     """
     sizes = (model.observation_space.shape, model.action_space.shape)
     if sizes != ((mdp.observation_size,), (mdp.action_size,)):
@@ -197,15 +200,16 @@ def from_sb3_model(
 
 
 def load(path: Path, mdp: MDP[Any], sb3: str | None = None) -> Policy | ForeignPolicy:
-    """A policy's directory, an ONNX file or a stable-baselines3 file.
+    """Loads a policy from its directory, an ONNX file or a stable-baselines3 file.
 
     Args:
-        path: of it.
-        mdp: that it is to act in.
-        sb3: the algorithm that saved the file, which says that whoever asks trusts it.
+        path: the directory or file.
+        mdp: the task in which the policy will act.
+        sb3: the algorithm that saved a stable-baselines3 file. Naming it means that the caller
+            trusts the file.
 
     Raises:
-        TsbenchError: there is no such policy, it is damaged, or it does not fit.
+        TsbenchError: the policy does not exist, is damaged, or does not fit the task.
     """
     if path.is_dir():
         return Policy.load(path)

@@ -1,4 +1,5 @@
-"""The oracle: what a motion would earn if the robot could follow it exactly, and the best known."""
+"""The oracle: the return of a given motion, as if physics followed it exactly, and the best return
+known."""
 
 from __future__ import annotations
 
@@ -13,13 +14,13 @@ from tsbench.core.task import Task
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one episode.
+    """The outcome of one episode.
 
     Attributes:
-        earned: its return.
-        normalized: that over the largest conceivable one.
-        solved: by `Task.success`.
-        measures: `Task.measures`; None for what it has none of.
+        earned: the return.
+        normalized: the return over the largest conceivable return.
+        solved: whether the episode was solved (`Task.success`).
+        measures: the figures of `Task.measures`; None for a figure that the episode lacks.
     """
 
     earned: float
@@ -29,13 +30,13 @@ class Outcome:
 
 
 def outcome(task: Task[Any], states: State, actions: np.ndarray | None = None) -> Outcome:
-    """What an episode through given states is worth, up to where the task ends it.
+    """The outcome of an episode through given states, up to the step at which the task ends it.
 
     Args:
-        task: that judges.
-        states: one per control step from the start, time as the batch axis, n + 1 of them.
-        actions: that led through them, shape (n, action_size); None where nothing acted, as along
-            a plan, and then `measures` lacks what needs actions.
+        task: the task that rewards and judges the states.
+        states: n + 1 states, one per control step from the start, with time as the batch axis.
+        actions: the actions between the states, shape (n, action_size). None for a plan, which has
+            no actions; `measures` then lacks the figures that need actions.
     """
     first = states.rows(slice(0, 1))
     before, after = states.rows(slice(0, -1)), states.rows(slice(1, None))
@@ -65,13 +66,15 @@ def outcome(task: Task[Any], states: State, actions: np.ndarray | None = None) -
 
 
 def best_return(task: Task[Any]) -> float:
-    """The return of `Task.ideal`, the best motion known under the planner's speed limits, since
-    no motion earns the largest conceivable reward at every step. A policy in full physics, which
-    those limits do not bind, may earn more."""
+    """The return of `Task.ideal`, the best motion known under the planner's speed limits.
+
+    No motion earns the largest conceivable reward at every step, so this return is a fairer scale.
+    The limits do not bind a policy in full physics, which may earn more.
+    """
     return outcome(task, task.ideal()).earned
 
 
 def known_mean(values: np.ndarray) -> float | None:
-    """Over the finite ones; None where there are none."""
+    """The mean of the finite values; None if no value is finite."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else None

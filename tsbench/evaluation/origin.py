@@ -1,4 +1,4 @@
-"""What a score depends on."""
+"""The origin of a score: the versions, hashes and machine that it depends on."""
 
 from __future__ import annotations
 
@@ -25,18 +25,20 @@ PACKAGES = ("mujoco", "numpy", "scipy", "tsbench")
 
 @dataclass(frozen=True)
 class Origin:
-    """What a score depends on.
+    """Everything that a score depends on.
 
     Attributes:
-        protocol: all of it, seed included.
-        task: its name.
-        task_version: of it.
+        protocol: the whole protocol, its seed included.
+        task: name of the task.
+        task_version: version of the task.
         mjcf: hash of the task's MJCF (`sim.model.fingerprint`).
-        model: hash of what mujoco compiled it to.
+        model: hash of the compiled model.
         constants: sha256 of the values that define the task (`Task.constants`).
-        policy: sha256 of the policy file, or None where there is none.
-        packages: versions, Python's and that of the package that brings the task too.
-        machine: what chooses kernels: architecture, vector extensions, BLAS, C library.
+        policy: sha256 of the policy file, or None for a policy without a file.
+        packages: versions of Python, of the packages that compute the score, and of the package
+            that brings the task.
+        machine: the properties of the machine by which numerical libraries choose their kernels:
+            architecture, vector extensions, BLAS, C library.
     """
 
     protocol: Protocol
@@ -51,7 +53,7 @@ class Origin:
 
     @classmethod
     def here(cls, task: Task[Any], protocol: Protocol, policy: PolicyFunction) -> Origin:
-        """Of a score that is made now, here."""
+        """The origin of a score that is made in this process."""
         spec = task.spec()
         provider = tasks.provider(task.name)
         plugin = {} if provider is None else {provider.distribution: provider.version}
@@ -71,10 +73,10 @@ class Origin:
 
 
 def machine() -> dict[str, str]:
-    """What decides which numerical kernels run here."""
+    """The properties of this machine by which numerical libraries choose their kernels."""
     extensions = np.show_config(mode="dicts")["SIMD Extensions"]
     libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
-    # scipy has one of its own; they come in no order.
+    # scipy brings its own BLAS, and threadpoolctl lists the libraries in no fixed order.
     libraries.sort(key=lambda one: ("numpy" not in one["filepath"], one["filepath"]))
     first = libraries[0] if libraries else {}
     blas = [str(first.get(name)) for name in ("internal_api", "version", "architecture")]
@@ -87,7 +89,7 @@ def machine() -> dict[str, str]:
 
 
 def constants_hash(task: Task[Any]) -> str:
-    """sha256 of `Task.constants`, in which numbers, strings, tuples, mappings and dataclasses may
-    be nested."""
+    """sha256 of `Task.constants`. Numbers, strings, tuples, mappings and dataclasses may be nested
+    in them."""
     content = json.dumps(dict(task.constants()), sort_keys=True, default=asdict)
     return hashlib.sha256(content.encode()).hexdigest()

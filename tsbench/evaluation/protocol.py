@@ -1,26 +1,26 @@
 """Evaluation protocol v1: everything that a score depends on beside the policy and the task.
 
-It is frozen, and a test holds its hash. Whatever would change a number here makes a new protocol
-with a new name. All policies meet the same starts, changes and pushes (common random numbers), and
-an episode that fails stays in every mean as the failure that it is.
+The protocol is frozen, and a test holds its hash. Another number makes a new protocol with a new
+name. All policies meet the same starts, changes and pushes (common random numbers). Every mean
+includes the episodes that fail.
 
 1. *Nominal*: one episode from the task's own start.
-2. *Perturbed*: 100 episodes from the task's distribution of starts (`Task.start`). Episode i
-   takes its start from a generator seeded with (seed, i), so that it can be had alone.
-3. *Changes*: the first 20 of those starts in changed physics: other masses, friction and motors,
-   actions that come late, and another contact model (an elliptic cone, half the time step): what
-   a policy does must not hang on the solver that it was trained in.
-4. *Pushes*: a horizontal force (for the rocket, one in its plane) on the body's centre of mass for
-   0.1 s, at 16 headings and at every phase of the motion (`Task.push_steps`), in the nominal
-   episode. The forces are those on a body of Laikago's mass; on another they are scaled by mass,
-   so that a push would change the velocity of a free body by the same: 100 N by 0.393 m/s. What
-   comes before the push is the same for all, so that it is played once and gone on from; what
-   comes after is played to the end of the episode.
+2. *Perturbed*: 100 episodes from the task's distribution of starts (`Task.start`). A generator
+   seeded with (seed, i) draws the start of episode i, so that each episode can be repeated alone.
+3. *Changes*: the first 20 perturbed starts in changed physics: other masses, friction and motor
+   strength, late actions, and another contact model (an elliptic cone, half the time step). A score
+   must not depend on the solver in which the policy was trained.
+4. *Pushes*: a force on the body's centre of mass for 0.1 s during the nominal episode, at 16
+   headings in the task's push plane and at every phase of the motion (`Task.push_steps`). The
+   protocol gives the forces on a body of Laikago's mass. They are scaled by mass for other bodies,
+   so that equal pushes change the velocity of a free body equally: 100 N by 0.393 m/s. The steps
+   before a push are the same for all pushes and are played once. The steps after a push are played
+   to the end of the episode.
 
-*Solved*: what the task calls success (`Task.success`), judged over the whole episode.
+*Solved*: the whole episode meets the task's definition of success (`Task.success`).
 *Survived*: the episode went on to its last step or its goal without a violation. A fall, a
-collision, and leaving the world or straying beyond the start are failures, and so is an episode
-that is over before its push: nobody has seen it survive. *Recovered*: survived and solved.
+collision, leaving the world and straying beyond the start are failures. An episode that ends before
+its push has not survived the push. *Recovered*: survived and solved.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class Condition:
     """Physics that a policy was not trained for.
 
     Attributes:
-        name: as the score has it.
-        change: to the model.
+        name: the key of this condition in a score.
+        change: the change of the model.
         delay: control steps by which actions come late.
     """
 
@@ -53,29 +53,31 @@ class Condition:
     delay: int = 0
 
     def on(self, physics: Change) -> Condition:
-        """The same on top of another physics."""
+        """The same condition on top of other physics."""
         return replace(self, change=self.change.after(physics))
 
 
 @dataclass(frozen=True)
 class Protocol:
     """Attributes:
-    name: as the score has it.
-    ranked: whether a score by it can stand on a leaderboard.
-    seed: of all random starts.
-    perturbed: episodes from perturbed starts.
-    changed: how many of the same starts are played in each changed physics.
+    name: the name of the protocol, which a score carries.
+    ranked: whether a leaderboard may rank scores by this protocol.
+    seed: seed of all random starts.
+    perturbed: number of episodes from perturbed starts.
+    changed: number of these starts that are also played in each changed physics.
     conditions: the changed physics.
-    headings: of the pushes, evenly spread from the first axis of `Task.push_plane` on.
-    phases: of the pushes: 1 takes all of `Task.push_steps`, 2 every second one.
-    forces: of the pushes in newtons, on a body of `REFERENCE_MASS`, rising.
-    claim: the one of them that the paper claims to be survived.
-    duration: of the pushes in seconds.
-    logged: perturbed episodes whose actions are kept, to replay the physics from.
-    tolerance: by which shares may differ on another kind of machine, and rewards as shares of the
-        best motion's.
-    impulse_tolerance: the same for impulses, as a share.
-    physics: what everything is played in; the changes of the conditions come on top.
+    headings: number of headings of the pushes, evenly spread from the first axis of
+        `Task.push_plane`.
+    phases: stride through `Task.push_steps`: 1 takes every phase, 2 every second one.
+    forces: forces of the pushes in newtons on a body of `REFERENCE_MASS`, rising.
+    claim: the force that the paper claims a policy to survive.
+    duration: seconds of a push.
+    logged: number of perturbed episodes whose actions are kept, so that the physics can be
+        replayed.
+    tolerance: allowed difference of shares between kinds of machine. Rewards may differ by this
+        share of the best motion's reward.
+    impulse_tolerance: allowed difference of impulses, as a share of the larger one.
+    physics: the physics of all episodes. The changes of the conditions come on top.
     """
 
     name: str
@@ -99,7 +101,7 @@ class Protocol:
         return np.arange(self.headings) * (2.0 * math.pi / self.headings)
 
     def elsewhere(self, physics: str) -> Protocol:
-        """The same asked in another physics, one of `PHYSICS`. No score by it can be ranked."""
+        """The same protocol in other physics, one of `PHYSICS`. Its scores are never ranked."""
         name = f"{self.name} in {physics}"
         return replace(self, name=name, ranked=False, physics=PHYSICS[physics])
 
@@ -133,7 +135,7 @@ V1 = Protocol(
     phases=1,
     forces=(50, 100, 150, 200, 250, 300, 350, 400, 450, 500, 550, 600),
 )
-# For runs that take seconds: the same questions, asked too seldom for an answer.
+# For runs that take seconds: the same parts with too few episodes to judge a policy.
 SMOKE = Protocol(
     name="smoke",
     ranked=False,
@@ -149,7 +151,8 @@ PROTOCOLS = {protocol.name: protocol for protocol in (V1, SMOKE)}
 
 
 def perturbed_starts(task: Task[Any], protocol: Protocol) -> Start:
-    """Episode i starts as a dm_control environment of the task seeded with (seed, i) does."""
+    """The starts of the perturbed episodes. A generator seeded with (seed, i) draws start i. A
+    dm_control environment of the task with that seed starts in the same state."""
     return Start.joined(
         [
             task.start(np.random.default_rng((protocol.seed, episode)), 1, perturbed=True)

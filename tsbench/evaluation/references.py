@@ -1,7 +1,8 @@
-"""Scores to hold others against: doing nothing, doing anything, and the best motion known.
+"""Reference rows, with which a score is compared: the policies `zero` and `random`, and the best
+motion known.
 
-The package that brings a task may keep them, in `references/TASK.json`.
-`python -m tsbench.evaluation.references TASK ...` makes such files, for all tasks where none is
+The package that brings a task may keep its rows in `references/TASK.json`.
+`python -m tsbench.evaluation.references TASK ...` makes these files, for all tasks if no task is
 named.
 """
 
@@ -27,7 +28,7 @@ from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.score import Score
 
 ROBUSTNESS = ("survival_100N", "recovery_100N", "survival_impulse_50", "recovery_impulse_50")
-DECIMALS = 6  # of an observation that the random policy tells apart
+DECIMALS = 6  # to which the random policy rounds an observation
 
 
 def zero(mdp: MDP[Any]) -> ForeignPolicy:
@@ -36,11 +37,11 @@ def zero(mdp: MDP[Any]) -> ForeignPolicy:
 
 
 def random(mdp: MDP[Any]) -> ForeignPolicy:
-    """Uniform actions. Each is drawn from a generator that its observation seeds, so that the
-    policy is a function, and repeats; rounded, since its last bits depend on the processor."""
+    """Uniform actions. The observation seeds the generator of the action, so that the policy is a
+    function. The observation is rounded, because its last bits depend on the processor."""
 
     def answer(observation: np.ndarray) -> np.ndarray:
-        seen = np.round(observation, DECIMALS) + 0.0  # -0.0 is 0.0
+        seen = np.round(observation, DECIMALS) + 0.0  # turns -0.0 into 0.0
         rng = np.random.default_rng(zlib.crc32(seen.tobytes()))
         return rng.uniform(-1.0, 1.0, mdp.action_size)
 
@@ -51,13 +52,15 @@ POLICIES: dict[str, Callable[[MDP[Any]], ForeignPolicy]] = {"random": random, "z
 
 
 def named(path: Path, mdp: MDP[Any]) -> ForeignPolicy | None:
-    """The reference policy of that name, unless there is a file or directory of that name."""
+    """The reference policy of that name; None if no such policy exists, or if a file or directory
+    has the name."""
     make = POLICIES.get(str(path))
     return None if make is None or path.exists() else make(mdp)
 
 
 def rows(task: Task[Any]) -> dict[str, Any]:
-    """The oracle's return and row, and those of the reference policies by protocol v1."""
+    """The content of a task's file: the return and row of the best motion known, and the rows of
+    the reference policies by protocol v1."""
     best = best_return(task)
     most = best / (task.max_reward * task.horizon)
     oracle = {
@@ -77,7 +80,7 @@ def rows(task: Task[Any]) -> dict[str, Any]:
 
 
 def row(score: Score) -> dict[str, Any]:
-    """The figures of a score that a reader compares with."""
+    """The figures of a score that a row shows."""
     return {
         **{
             name: getattr(score, name)
@@ -88,10 +91,10 @@ def row(score: Score) -> dict[str, Any]:
 
 
 def stored(task: str) -> dict[str, Any] | None:
-    """What `rows` gave for a task, from its file; None where there is none.
+    """The stored `rows` of a task; None for a task without a file.
 
     Raises:
-        TsbenchError: no such task.
+        TsbenchError: the task does not exist.
     """
     path = _file(task)
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
@@ -105,7 +108,7 @@ def _file(task: str) -> Path:
 
 
 def main(names: Sequence[str]) -> None:
-    """Makes the files of some tasks again."""
+    """Makes the files of these tasks again."""
     for name in names:
         content = json.dumps(rows(tasks.make(name)), indent=2) + "\n"
         path = _file(name)
@@ -115,8 +118,11 @@ def main(names: Sequence[str]) -> None:
 
 
 def beside(score: Score) -> dict[str, dict[str, Any]]:
-    """The rows of the reference policies, by name, that a score can be read beside: of the same
-    task by the same protocol. None for a task that has none, or has other constants here."""
+    """The stored rows of the reference policies, by name, for the task and protocol of a score.
+
+    Empty for a task without stored rows, and for a score by another protocol or with other
+    constants of the task.
+    """
     content = (stored(score.origin.task) if score.origin.task in tasks.names() else None) or {}
     if (score.protocol, score.origin.constants) != (
         content.get("protocol"), content.get("constants"),

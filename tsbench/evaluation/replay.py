@@ -1,11 +1,11 @@
-"""Whether a score can be had again, and how that is found out.
+"""Compares a kept score with a score of the same policy that was made again.
 
-On the same kind of machine with the same versions, a score repeats bit for bit. On another kind,
-numpy and BLAS choose other kernels, and a policy's output may differ in its last bits: the physics
-is then replayed from the actions that were kept, and the rest compared within the protocol's
-tolerance. mujoco uses none of their kernels, but the reward of a state does: from AVX2 to AVX-512
-rewards were seen to differ by 4e-15 of themselves. With another mujoco, another model or another
-policy there is nothing to compare.
+On the same kind of machine with the same versions, a score repeats bit for bit. On another kind of
+machine, numpy and BLAS choose other kernels, and a policy's output may differ in its last bits. The
+physics is then replayed from the kept actions, and the other figures are compared within the
+protocol's tolerance. mujoco uses none of these kernels, but the reward of a state does: rewards on
+AVX2 and on AVX-512 differ by about 4e-15 of their value. Scores by another mujoco, another model or
+another policy are not compared.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tsbench.evaluation.score import Score, Summary
 from tsbench.sim.episodes import Episodes, play
 from tsbench.sim.physics import Physics
 
-SAME_REWARD = 1e-12  # of itself, from kernel to kernel; another physics is farther off
+SAME_REWARD = 1e-12  # relative difference between kernels; other physics differs by more
 # Times the protocol's tolerance, for figures by which nothing is ranked: lengths and measures of
 # the perturbed episodes as shares of themselves, and the share of pushes that end otherwise.
 LOOSE = 3.0
@@ -34,12 +34,13 @@ _IMPULSES = ("impulse_50", "impulse_50_is_lower_bound")
 
 
 def replay(task: Task[Any], score: Score, log: ActionLog) -> bool:
-    """Whether the logged actions earn the logged rewards again, and those of the first episode the
-    nominal score, but for `SAME_REWARD`.
+    """Whether the logged actions earn the logged rewards again, to within `SAME_REWARD`.
+
+    The first logged episode must also earn the nominal normalized reward of the score.
 
     Args:
-        task: of the score.
-        score: that the log was kept with.
+        task: the task of the score.
+        score: the score with which the log was kept.
         log: actions and rewards.
     """
     protocol = score.origin.protocol
@@ -64,7 +65,7 @@ def replay(task: Task[Any], score: Score, log: ActionLog) -> bool:
 
 
 def _again(task: Task[Any], start: Start, actions: np.ndarray) -> Episodes[Any]:
-    """One episode, by its actions alone, shape (T, 1, action_size)."""
+    """One episode, played from its actions alone, shape (T, 1, action_size)."""
     physics: Physics[Any] = Physics(task, 1)
     following = iter(actions)
     begin = physics.place(np.arange(1), start)
@@ -74,9 +75,9 @@ def _again(task: Task[Any], start: Start, actions: np.ndarray) -> Episodes[Any]:
 @dataclass(frozen=True)
 class Comparison:
     """Attributes:
-    kind: "exact", "tolerant", or "none" where there was nothing to compare.
-    agrees: whether the scores do; None where there was nothing to compare.
-    words: which comparison was made, and what came of it.
+    kind: "exact", "tolerant", or "none" for scores that cannot be compared.
+    agrees: whether the scores agree; None for scores that cannot be compared.
+    words: the comparison and its result, in words.
     """
 
     kind: str
@@ -88,10 +89,10 @@ def compare(kept: Score, again: Score, task: Task[Any], log: ActionLog | None) -
     """Compares a kept score with one made again.
 
     Args:
-        kept: the first score.
-        again: the same policy's, made here.
-        task: of the score made here.
-        log: what was kept of the first score's actions, if anything.
+        kept: the kept score.
+        again: the score of the same policy that was made here.
+        task: the task of the score that was made here.
+        log: the kept actions of the first score, or None.
     """
     before, now = kept.origin, again.origin
     if words := incomparable(before, now):
@@ -122,7 +123,7 @@ def compare(kept: Score, again: Score, task: Task[Any], log: ActionLog | None) -
 
 
 def incomparable(before: Origin, now: Origin) -> str:
-    """What two scores do not have in common that makes them scores of different things."""
+    """The first difference that makes two scores incomparable, in words; empty if there is none."""
     protocol = replace(now.protocol, seed=before.protocol.seed)
     named: list[tuple[str, object, object]] = [
         ("another protocol", before.protocol.name, now.protocol.name),
@@ -130,7 +131,7 @@ def incomparable(before: Origin, now: Origin) -> str:
         ("another version of the task", before.task_version, now.task_version),
         ("another mujoco", before.packages.get("mujoco"), now.packages["mujoco"]),
     ]
-    unnamed: list[tuple[str, object, object]] = [  # long, or a seed that may be secret
+    unnamed: list[tuple[str, object, object]] = [  # too long to print, or a seed that may be secret
         ("other numbers in the protocol", before.protocol, protocol),
         ("another seed", before.protocol.seed, now.protocol.seed),
         ("another policy", before.policy, now.policy),
@@ -149,8 +150,9 @@ def differences(kept: Score, again: Score, best: float) -> list[str]:
 
     Args:
         kept: a score.
-        again: another, by the same protocol.
-        best: normalized reward of the best motion known: the tolerance of rewards is a share of it.
+        again: another score by the same protocol.
+        best: normalized reward of the best motion known. The tolerance of rewards is a share of
+            this reward.
     """
     protocol = again.origin.protocol
     first, second = _figures(kept), _figures(again)
@@ -166,7 +168,7 @@ def differences(kept: Score, again: Score, best: float) -> list[str]:
             bound *= best
         elif name.startswith("perturbed: "):
             bound *= LOOSE * max(abs(first[name]), abs(second[name]))
-        # Shares of twenty episodes differ by one: 0.05, which is more than 0.05 in binary.
+        # One of twenty episodes is a share of 0.05, which rounding may make larger than the bound.
         if not abs(first[name] - second[name]) <= bound * (1.0 + 1e-9):
             found.append(f"{name} {first[name]:.4g} there, {second[name]:.4g} here")
     for name in ("survived", "recovered"):
@@ -237,8 +239,11 @@ def _impossible(summary: Summary, episodes: int, task: Task[Any]) -> list[str]:
 
 
 def _figures(score: Score) -> dict[str, float]:
-    """The figures that are compared within a tolerance. The nominal episode is none of them: one
-    episode may turn on a last bit. It is among those whose physics is replayed."""
+    """The figures that are compared within a tolerance.
+
+    The figures of the nominal episode are left out, because the last bit of an action may change
+    the outcome of a single episode. Its physics is replayed instead.
+    """
     return {
         "against_plan": score.against_plan,
         "perturbed.solved_reward": score.perturbed.solved_reward,

@@ -1,4 +1,4 @@
-"""Pushes: which are survived and recovered from, over force, heading and phase; in figures."""
+"""Robustness: the pushes that a policy survives and recovers from, by force, heading and phase."""
 
 from __future__ import annotations
 
@@ -17,18 +17,20 @@ from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push, direction
 
-# Pushes that are played side by side. Each rocket takes 15 MB of address space; more are no faster.
+# Pushes that are played side by side. A rocket takes 15 MB of address space, and larger blocks are
+# no faster.
 _BLOCK = 128
 
 
 @dataclass(frozen=True)
 class Surface:
     """Attributes:
-    forces_N: as they act on this task's body.
-    headings_rad: from the first axis of `Task.push_plane` to the second.
+    forces_N: the forces on this task's body.
+    headings_rad: angles from the first axis of `Task.push_plane` towards the second.
     phases: control steps at which the pushes begin.
-    survived: by force, heading and phase, 0 or 1.
-    recovered: survived and solved, the same.
+    survived: 1 for each push that was survived, else 0, by force, heading and phase.
+    recovered: 1 for each push that was survived and after which the task was solved, else 0, in
+        the same order.
     """
 
     forces_N: tuple[float, ...]  # noqa: N815  newtons
@@ -48,21 +50,22 @@ class Surface:
 
 @dataclass(frozen=True)
 class Robustness:
-    """What a policy stands, over a fixed grid of pushes, all of which are tried: the shares are
-    exact, no samples of anything.
+    """The pushes that a policy withstands. Every push of a fixed grid is tried once, so the shares
+    are exact and no samples.
 
     Attributes:
-        survival_100N: share of the pushes of the paper's claim that are survived.
-        recovery_100N: that are survived and solved.
+        survival_100N: share of the pushes with the force of the paper's claim that are survived.
+        recovery_100N: share of the same pushes that are recovered from: survived, and the task
+            solved.
         survival_impulse_50: the impulse in N s at which half of the pushes are survived
             (`impulse_50`).
-        survival_impulse_50_is_lower_bound: more than half survive the largest impulse tried, which
-            it is.
-        recovery_impulse_50: the same of pushes that are recovered from.
-        recovery_impulse_50_is_lower_bound: the same.
-        mass_scale: of this task's body to Laikago's; all forces are scaled by it.
-        push_duration_s: of every push.
-        surface: every push that was tried.
+        survival_impulse_50_is_lower_bound: whether more than half of the pushes with the largest
+            impulse are survived. `survival_impulse_50` is then that impulse.
+        recovery_impulse_50: the impulse in N s at which half of the pushes are recovered from.
+        recovery_impulse_50_is_lower_bound: the same as for survival.
+        mass_scale: mass of this task's body over Laikago's. All forces are scaled by this number.
+        push_duration_s: seconds of every push.
+        surface: every push, with its outcome.
     """
 
     survival_100N: float  # noqa: N815
@@ -79,10 +82,9 @@ class Robustness:
 @dataclass(frozen=True)
 class Outcome:
     """Attributes:
-    survived: which pushes are, shape (forces, headings, phases).
-    recovered: which are survived and solved, the same shape.
-    calm: whether the episode without a push is survived; and whether it is recovered, that is
-        solved too.
+    survived: whether each push is survived, shape (forces, headings, phases).
+    recovered: whether each push is survived and the task solved, the same shape.
+    calm: whether the episode without a push is survived, and whether it is also solved.
     """
 
     survived: np.ndarray
@@ -93,7 +95,7 @@ class Outcome:
 def robustness(
     policy: PolicyFunction, task: Task[Any], protocol: Protocol, threads: int | None = None
 ) -> Robustness:
-    """Pushes a policy in every way that the protocol says."""
+    """Plays every push of the protocol."""
     scale = mass_scale(task)
     forces = np.array(protocol.forces, float) * scale
     phases = task.push_steps[:: protocol.phases]
@@ -127,7 +129,7 @@ def _plain(surface: np.ndarray) -> tuple[tuple[tuple[int, ...], ...], ...]:
 
 
 def mass_scale(task: Task[Any]) -> float:
-    """Mass of what a push moves, over Laikago's."""
+    """The mass that a push moves, over Laikago's mass."""
     model = task.spec().compile()
     mass = float(model.body_subtreemass[model.body(task.pushed).id])
     return round(mass / REFERENCE_MASS, 6)
@@ -141,15 +143,15 @@ def pushed(
     protocol: Protocol,
     threads: int | None = None,
 ) -> Outcome:
-    """What comes of every push.
+    """The outcome of every push.
 
     Args:
-        policy: that is pushed.
-        task: its task.
+        policy: the policy of the pushed robot.
+        task: the task of the policy.
         forces: newtons, shape (n,).
-        phases: control steps at which pushes begin.
-        protocol: says headings, duration and physics.
-        threads: for the physics, None for all cores.
+        phases: control steps at which the pushes begin.
+        protocol: gives headings, duration and physics.
+        threads: threads of the physics, None for all cores.
     """
     moments = _moments(policy, task, phases, protocol.physics, threads)
     headings = protocol.directions()
@@ -157,7 +159,7 @@ def pushed(
     survived, recovered = np.zeros(shape, bool), np.zeros(shape, bool)
     if not moments.alive.any():
         return Outcome(survived, recovered, moments.calm)
-    # By phase: what is pushed at one instant has as many steps left.
+    # Sorted by phase, so that the episodes of a block have about equally many steps left.
     grid = np.moveaxis(np.broadcast_to(moments.alive, shape), -1, 0)
     phase, force, heading = np.nonzero(grid)
     starts, courses = moments.starts.rows(phase), moments.courses.rows(phase)
@@ -166,7 +168,7 @@ def pushed(
         duration=np.full(len(phase), protocol.duration),
         force=forces[force, None] * direction(task, headings[heading]),
     )
-    # The blocks share one physics: memory that is freed in between does not always go back.
+    # All blocks share one physics, because freed memory does not always return to the system.
     physics: Physics[Any] = Physics(
         task, min(_BLOCK, len(phase)), threads=threads, change=protocol.physics
     )
@@ -187,10 +189,10 @@ class _Moments:
     """The nominal episode at each phase.
 
     Attributes:
-        starts: places to go on from, one for each phase.
-        courses: that led there.
-        alive: whether the episode had not ended by then, shape (phases,).
-        calm: whether it survived without a push, and whether it was solved too.
+        starts: the state at each phase, from which pushed episodes begin.
+        courses: the course of the episode up to each phase.
+        alive: whether the episode had not ended before each phase, shape (phases,).
+        calm: whether the nominal episode is survived, and whether it is also solved.
     """
 
     starts: Start
@@ -234,19 +236,21 @@ def _moments(
 def impulse_50(
     impulses: np.ndarray, shares: np.ndarray, unpushed: bool = True
 ) -> tuple[float, bool]:
-    """The smallest impulse that half of the pushes withstand: survive, or recover from.
+    """The smallest impulse at which at most half of the pushes are withstood.
 
-    Their share over impulse is first made to fall monotonically, by the nearest such sequence in
-    least squares, and then interpolated linearly between the impulses. No push is an impulse of
-    zero, which all or none withstand.
+    The shares are first replaced by the nearest sequence, in least squares, that never rises with
+    the impulse. They are then interpolated linearly between the impulses. The episode without a
+    push gives the share at an impulse of zero, which is 1 or 0.
 
     Args:
-        impulses: tried, in N s, rising, shape (n,).
-        shares: of the pushes withstood at each, shape (n,).
-        unpushed: whether the episode without a push counts as one.
+        impulses: the impulses of the pushes in N s, rising, shape (n,).
+        shares: share of the pushes that are withstood (survived, or recovered from) at each
+            impulse, shape (n,).
+        unpushed: whether the episode without a push is withstood.
 
     Returns:
-        N s; and whether that is only a lower bound, since more than half withstand the largest.
+        The impulse in N s, and whether the impulse is only a lower bound, because more than half of
+        the largest pushes are withstood.
     """
     x = np.concatenate([[0.0], impulses])
     y = isotonic_regression(np.concatenate([[float(unpushed)], shares]), increasing=False).x

@@ -18,16 +18,16 @@ class Summary:
     """Means over episodes.
 
     Attributes:
-        episodes: how many.
-        normalized_reward: return over the largest conceivable one.
-        solved_reward: the same with every episode that was not solved counted as zero.
-        success: share of episodes solved.
-        violations: share spoiled on the way: a fall, a collision.
-        steps: mean length in control steps.
-        goal_distance: mean at the end, in metres.
-        measures: the task's own (`Task.measures`), each over the episodes that have it; None
-            where none has.
-        solved: of each episode, 0 or 1.
+        episodes: number of episodes.
+        normalized_reward: return over the largest conceivable return.
+        solved_reward: the same mean, in which an unsolved episode counts as zero.
+        success: share of solved episodes.
+        violations: share of episodes with a violation on the way, such as a fall or a collision.
+        steps: length in control steps.
+        goal_distance: metres from the goal at the end.
+        measures: the task's own figures (`Task.measures`). Each is the mean over the episodes that
+            have the figure, or None if no episode has it.
+        solved: 1 for each solved episode, else 0.
     """
 
     episodes: int
@@ -55,18 +55,19 @@ class Summary:
 @dataclass(frozen=True)
 class Score:
     """Attributes:
-    protocol: its name.
-    solved_reward: the headline, by which policies are ranked: over the perturbed starts.
-    normalized_reward: over the perturbed starts.
-    success: share of the perturbed starts solved.
-    against_plan: mean return from the perturbed starts over that of the best motion known under
-        the planner's speed limits (`Task.ideal`), which do not bind a policy: it may pass 1.
+    protocol: name of the protocol.
+    solved_reward: `Summary.solved_reward` of the perturbed starts, by which policies are ranked.
+    normalized_reward: `Summary.normalized_reward` of the perturbed starts.
+    success: share of the perturbed starts that were solved.
+    against_plan: mean return from the perturbed starts over the return of the best motion known
+        under the planner's speed limits (`Task.ideal`). The limits do not bind a policy, so the
+        quotient may pass 1.
     perturbed: episodes from perturbed starts.
     nominal: the episode from the task's own start.
     changes: episodes in changed physics, by the name of the condition.
     robustness: survival and recovery under pushes.
-    origin: what it depends on.
-    log: actions to replay the physics from; it is kept in a file of its own.
+    origin: everything that the score depends on.
+    log: the actions from which the physics can be replayed. The log has a file of its own.
     """
 
     protocol: str
@@ -87,7 +88,7 @@ class Score:
                 raise ValueError(f"{name} must be that of the perturbed starts")
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, all but the log."""
+        """The score as plain values, without the log."""
         values = asdict(replace(self, log=None))
         del values["log"]
         return values

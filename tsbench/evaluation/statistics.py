@@ -1,9 +1,8 @@
-"""What several training seeds say together (Agarwal et al. 2021, arXiv 2108.13264).
+"""Statistics over training seeds (Agarwal et al. 2021, arXiv 2108.13264).
 
-Scores come as one sample for each task: the scores of its training seeds. Every task has the same
-weight, whatever its number of runs. A row needs `RANKED_SEEDS` seeds of each task to be ranked,
-and only then has an interval: a 95 % percentile bootstrap of three seeds covers 74 %, of ten 90 to
-93 %.
+The scores of a task's training seeds are one sample. Every task has the same weight, whatever its
+number of runs. A row is ranked, and has an interval, from `RANKED_SEEDS` seeds of each task on. The
+reason is coverage: a 95 % percentile bootstrap of three seeds covers 74 %, of ten seeds 90 to 93 %.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ LEVEL = 0.95
 class Aggregate:
     """Attributes:
     iqm: interquartile mean over all runs, every task with equal weight.
-    interval: 95 % stratified bootstrap interval of it, or None below `RANKED_SEEDS` seeds.
-    standing: what the row counts as (`standing`).
-    seeds: of each task, exactly those that were run.
-    scores: of those, in the same order.
+    interval: 95 % stratified bootstrap interval of `iqm`, or None below `RANKED_SEEDS` seeds.
+    standing: "ranked", "provisional" or "too few" (`standing`).
+    seeds: the training seeds of each task that were run.
+    scores: the scores of these seeds, in the same order.
     """
 
     iqm: float
@@ -40,12 +39,13 @@ class Aggregate:
 
 
 def aggregate(scores: Mapping[str, Mapping[int, float]]) -> Aggregate:
-    """
+    """Interquartile mean, interval and standing of a method.
+
     Args:
         scores: by task and training seed.
 
     Raises:
-        ValueError: there are no scores, or not of every task.
+        ValueError: the mapping is empty, or a task has no scores.
     """
     seeds = {task: tuple(sorted(runs)) for task, runs in scores.items()}
     columns = {task: tuple(scores[task][seed] for seed in seeds[task]) for task in scores}
@@ -56,8 +56,10 @@ def aggregate(scores: Mapping[str, Mapping[int, float]]) -> Aggregate:
 
 
 def standing(samples: Sequence[np.ndarray]) -> str:
-    """What a row of scores counts as: "ranked" from `RANKED_SEEDS` training seeds of every task on,
-    "provisional" from `PROVISIONAL_SEEDS` on (dots without an interval), else "too few".
+    """The standing of a row of scores.
+
+    A row is "ranked" from `RANKED_SEEDS` training seeds of every task on, "provisional" from
+    `PROVISIONAL_SEEDS` on (shown as dots without an interval), and otherwise has "too few".
 
     Raises:
         ValueError: a task has no runs.
@@ -71,10 +73,11 @@ def standing(samples: Sequence[np.ndarray]) -> str:
 def iqm(samples: Sequence[np.ndarray]) -> float:
     """Interquartile mean: the mean of the middle half of all runs.
 
-    The runs of a task share its weight, which is the same for every task. Of the runs in order,
-    those count that lie between a quarter and three quarters of the whole weight; a run across one
-    of these borders counts by the part of it that lies inside. Where all tasks have the same number
-    of runs, and a quarter of all is a whole number, this is the 25 % trimmed mean.
+    All tasks have the same weight, which the runs of a task share equally. The runs of all tasks
+    are sorted by score, and the mean is over the runs between a quarter and three quarters of the
+    whole weight. A run across one of these borders counts with the part of its weight that lies
+    inside. If all tasks have the same number of runs, and a quarter of all runs is a whole number,
+    this is the 25 % trimmed mean.
 
     Raises:
         ValueError: a task has no runs.
@@ -84,7 +87,7 @@ def iqm(samples: Sequence[np.ndarray]) -> float:
 
 def _iqm(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
     runs = np.concatenate([np.moveaxis(sample, axis, -1) for sample in samples], axis=-1)
-    # Whole numbers, so that nothing is rounded at the borders.
+    # Weights are whole numbers, so that nothing is rounded at the borders.
     counts = [sample.shape[axis] for sample in samples]
     share = math.lcm(*counts)  # the weight of a task
     whole = share * len(samples)
@@ -98,8 +101,8 @@ def _iqm(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def iqm_interval(samples: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float] | None:
-    """95 % percentile bootstrap interval of the interquartile mean, stratified: the runs of each
-    task are drawn among themselves. None where a task has fewer than `RANKED_SEEDS` runs.
+    """95 % percentile bootstrap interval of the interquartile mean, stratified by task: the runs of
+    each task are resampled separately. None if a task has fewer than `RANKED_SEEDS` runs.
 
     Raises:
         ValueError: a task has no runs.
@@ -112,10 +115,11 @@ def iqm_interval(samples: Sequence[np.ndarray], seed: int = 0) -> tuple[float, f
 @dataclass(frozen=True)
 class Difference:
     """Attributes:
-    mean: of the first method's score less the second's, seed by seed, every task with equal weight.
-    interval: 95 % stratified bootstrap interval of it, or None below `RANKED_SEEDS` pairs.
-    p_value: how probable a mean at least so far from zero is if each pair could as well have been
-        the other way round: a sign-flip permutation test, two-sided.
+    mean: mean difference of the first method's score minus the second's, over pairs of the same
+        task and seed, every task with equal weight.
+    interval: 95 % stratified bootstrap interval of `mean`, or None below `RANKED_SEEDS` pairs.
+    p_value: of a two-sided sign-flip permutation test: the probability of a mean at least as far
+        from zero if the sign of each difference were random.
     """
 
     mean: float
@@ -128,15 +132,15 @@ def paired_difference(
     second: Mapping[str, Mapping[int, float]],
     seed: int = 0,
 ) -> Difference:
-    """What one method scores more than another, by pairs of the same task and training seed.
+    """The difference of two methods' scores, over pairs of the same task and training seed.
 
     Args:
-        first: scores by task and training seed.
-        second: the same of the other method.
-        seed: of the resampling.
+        first: scores of the first method by task and training seed.
+        second: scores of the second method by task and training seed.
+        seed: seed of the resampling.
 
     Raises:
-        ValueError: there are no scores, or the two have other tasks or other seeds.
+        ValueError: a mapping is empty, or the methods have different tasks or seeds.
     """
     if first.keys() != second.keys():
         raise ValueError("both must have scores of the same tasks")
@@ -171,8 +175,11 @@ def _mean(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    """p-values of several comparisons in one table, each raised so that the chance of a single
-    false finding among all of them stays below the level that it is held against (Holm 1979)."""
+    """Adjusts the p-values of several comparisons in one table (Holm 1979).
+
+    If a finding is a p-value below some level, the probability of any false finding in the table
+    stays below that level.
+    """
     adjusted: dict[str, float] = {}
     largest = 0.0
     for rank, (name, p_value) in enumerate(sorted(p_values.items(), key=lambda one: one[1])):
@@ -184,16 +191,16 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 def compared(
     method: str, table: Mapping[str, Mapping[str, Mapping[int, float]]], seed: int = 0
 ) -> dict[str, Difference]:
-    """What a method scores more than every other of a table, with p-values after Holm over all of
-    these comparisons.
+    """The difference of a method to every other method of a table, with p-values adjusted for the
+    number of comparisons (`holm`).
 
     Args:
-        method: its name.
+        method: name of the method.
         table: scores by method, task and training seed.
-        seed: of the resampling.
+        seed: seed of the resampling.
 
     Raises:
-        ValueError: as `paired_difference`.
+        ValueError: see `paired_difference`.
     """
     found = {
         name: paired_difference(table[method], scores, seed)
@@ -205,7 +212,7 @@ def compared(
 
 
 def _interval(samples: Sequence[np.ndarray], statistic: Any, seed: int) -> tuple[float, float]:
-    """Of a statistic of one sample for each task, whose runs are drawn among themselves."""
+    """Bootstrap interval of a statistic of one sample per task, each resampled separately."""
     found = bootstrap(
         tuple(samples),
         statistic,
@@ -230,15 +237,15 @@ def performance_profile(samples: Sequence[np.ndarray], thresholds: np.ndarray) -
 
 
 def probability_of_improvement(first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> float:
-    """How probably a run of the first method beats one of the second on a task drawn at random;
-    a tie counts by half.
+    """The probability that a run of the first method beats a run of the second on a random task. A
+    tie counts as one half.
 
     Args:
-        first: one sample for each task.
-        second: the same of the other method, in the same order of tasks.
+        first: samples of the first method, one for each task.
+        second: samples of the second method, in the same order of tasks.
 
     Raises:
-        ValueError: a task has no runs, or the tasks are not the same in number.
+        ValueError: a task has no runs, or the methods have different numbers of tasks.
     """
     pairs = zip(_checked(first), _checked(second), strict=True)
     return float(np.mean([mannwhitneyu(a, b).statistic / (len(a) * len(b)) for a, b in pairs]))

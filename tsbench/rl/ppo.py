@@ -79,9 +79,9 @@ class Learner:
         self._update = make_update(self._actor, self._critic, storage, settings)
         if actor_from is not None:
             self._actor.load_state_dict(actor_from._actor.state_dict())
-            self._critic.obs_normalizer.load_state_dict(
-                actor_from._critic.obs_normalizer.state_dict()
-            )
+            seen = actor_from._critic.obs_normalizer
+            if seen.mean.shape == self._critic.obs_normalizer.mean.shape:  # the same disturbances
+                self._critic.obs_normalizer.load_state_dict(seen.state_dict())
             with torch.no_grad():
                 self._actor.distribution.log_std_param.fill_(math.log(settings.initial_std))
 
@@ -201,8 +201,8 @@ class Learner:
             self._update.learning_rate = rate
 
     def _credit(self, extras: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """What the steps that an arrival spares are credited with, as scores have it, in rewards
-        per step and discounted by actions."""
+        """The credit for the steps that an arrival spares, as in scores, in rewards per step and
+        discounted by actions."""
         s = self.settings
         spared, quality = extras["spared"] / s.repeat, extras["quality"]
         return self.environment.mdp.credit(spared, quality, s.discount**s.repeat)

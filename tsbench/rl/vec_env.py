@@ -94,8 +94,7 @@ class TorchEnvironment(VecEnv):
             self._observation[name].copy_(torch.from_numpy(value))
 
     def _tensors(self, observation: np.ndarray) -> TensorDict:
-        environment = self.environment
-        value = environment.mdp.value_observation(environment.state)
+        value = self.environment.value_observation()
         encoded = {"policy": self._encode(observation), "value": self._encode(value)}
         tensors = {name: self._floats(group) for name, group in encoded.items()}
         return TensorDict(tensors, batch_size=[self.num_envs])

@@ -109,6 +109,12 @@ class BatchedEnvironment(Generic[S]):
         self.seconds += perf_counter() - began
         return Transition(observation, reward, terminal, truncated, ended, final, spared, quality)
 
+    def value_observation(self) -> np.ndarray:
+        """What a critic sees, shape (n, any): as the MDP says, and what the dynamics hide."""
+        value: np.ndarray = self.mdp.value_observation(self.state)
+        unseen = self.dynamics.unseen()
+        return np.column_stack([value, *unseen]) if unseen else value
+
     def snapshot(self) -> dict[str, Any]:
         """Everything that the next step depends on besides the action: plain values and arrays."""
         return {

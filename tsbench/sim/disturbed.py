@@ -89,10 +89,11 @@ class DisturbedPhysics(Physics[S]):
         )  # newest first
         rng = np.random.default_rng(seed)
         bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
+        self._factors: np.ndarray | None = None
         if any(bounds):
-            factors = 1.0 + rng.uniform(-1.0, 1.0, (count, 3)) * bounds
+            self._factors = 1.0 + rng.uniform(-1.0, 1.0, (count, 3)) * bounds
             self._models = [copy.copy(self.batch.model) for _ in range(count)]
-            for model, (mass, friction, strength) in zip(self._models, factors, strict=True):
+            for model, (mass, friction, strength) in zip(self._models, self._factors, strict=True):
                 Change(mass, friction, strength).apply(model)
             self.batch.set_models(self._models)
 
@@ -113,6 +114,13 @@ class DisturbedPhysics(Physics[S]):
             self._actions[at, 0] = action
             action = self._actions[at, self._latency[at]]
         return super().advance(state, action, rows)
+
+    def unseen(self) -> tuple[np.ndarray, ...]:
+        """Factors of mass, friction and motor strength, and the latency in control steps, where
+        they are disturbed. How well an episode goes hangs on them, so a critic that does not know
+        them takes them for merits of the actions."""
+        factors = () if self._factors is None else tuple(self._factors.T)
+        return (*factors, self._latency) if self.disturbances.latency else factors
 
     def _draw(self, rng: Rng, rows: np.ndarray) -> None:
         shape = (len(rows), self._forces.shape[1])

@@ -34,6 +34,10 @@ class Dynamics(Protocol[S]):
 class LastingDynamics(Dynamics[S], Protocol[S]):
     """Dynamics that can be saved and restored."""
 
+    def unseen(self) -> tuple[np.ndarray, ...]:
+        """What the next states depend on beside state and action, each of shape (episodes,). A
+        policy never sees it; a critic, which only training needs, may."""
+
     def snapshot(self) -> dict[str, Any]:
         """All data that is kept between two calls: plain values and arrays."""
 

@@ -24,19 +24,20 @@ class Episodes(Generic[S]):
         rewards: shape (T, n); zero once an episode has ended.
         lengths: steps taken, shape (n,).
         limits: steps that could be taken, shape (n,): T, or less where an episode began late.
-        spared: steps that the episode did not need, since it arrived at its goal, shape (n,).
-        course: of each episode. Its physics having diverged, which ends it with a reward of zero
-            for that step, is a violation.
-        diverged: whether that happened, shape (n,).
+        spared: steps that an arrival at the goal left of the horizon, shape (n,).
+        course: the course of each episode. Diverged physics is a violation. It ends the episode
+            with a reward of zero for that step.
+        diverged: whether the physics diverged, shape (n,).
         cut: whether the episode ended for a reason other than its goal or its last step, (n,).
-        credit: what the spared steps earn (`MDP.credit`), shape (n,).
-        first: the state that each episode began in, or went on from.
+        credit: the reward of the spared steps (`MDP.credit`), shape (n,).
+        first: the first state of each episode.
         final: the last state of each episode.
-        sums: what `measure` gave, summed over the steps of each episode, by name, each of shape
-            (n,); a step that the physics could not compute counts as nothing.
-        states: what `record` made of every state, start included, shape (T + 1, n, ...), each
-            episode's last one repeated after its end; None without `record`.
-        actions: as they were applied, shape (T, n, action_size), zero once an episode has ended.
+        sums: the results of `measure`, summed over the steps of each episode, by name, each of
+            shape (n,). A step at which the physics diverged adds nothing.
+        states: the results of `record` for every state, the start included, shape
+            (T + 1, n, ...). An episode's last result is repeated after its end. None without
+            `record`.
+        actions: the applied actions, shape (T, n, action_size), zero after an episode's end.
         max_reward: per time step.
     """
 
@@ -68,7 +69,7 @@ class Episodes(Generic[S]):
 
     @property
     def survived(self) -> np.ndarray:
-        """Whether it went on unspoiled to its goal or its last step, shape (n,)."""
+        """Whether the episode went on without a violation to its goal or last step, shape (n,)."""
         survived: np.ndarray = ~self.course.violated & ~self.cut
         return survived
 

@@ -82,6 +82,9 @@ class Planning(MDP[S]):
     def advance(self, state: S, action: Array, rows: np.ndarray | None = None) -> S:
         return self.abstraction.advance(state, action)
 
+    def unseen(self) -> tuple[np.ndarray, ...]:
+        return ()
+
     def snapshot(self) -> dict[str, Any]:
         return {"explore": self.explore}
 

@@ -120,6 +120,9 @@ class Physics(Generic[S]):
             return np.zeros((len(time), 3))
         return self.push.rows(rows).during(time, self.task.timestep)
 
+    def unseen(self) -> tuple[np.ndarray, ...]:
+        return ()
+
     def warned(self) -> dict[str, int]:
         """Number of mujoco warnings by mujoco's name of their kind; kinds that never came are left
         out."""

@@ -87,7 +87,7 @@ class Adapter(control.Task):
         return int(self.mdp.spared(self.state, self.course)[0]) if ended else 0
 
     def quality(self) -> float:
-        """What each spared step is worth beside a perfect one (`MDP.quality`), in [0, 1]."""
+        """Worth of each spared step as a share of a perfect step (`MDP.quality`), in [0, 1]."""
         return float(self.mdp.quality(self.course)[0])
 
     def action_spec(self, physics: dm_mujoco.Physics) -> dm_env.specs.BoundedArray:

@@ -122,15 +122,15 @@ class LaikagoState(State):
 
 @dataclass(frozen=True)
 class LaikagoCourse(Course):
-    """How an episode's feet kept to the schedule.
+    """The agreement of an episode's footfall with the schedule.
 
     Attributes:
         nearest: smallest distance to the goal so far in metres, shape (...,).
-        stance: share of the feet that were to stand, summed over control steps, each weighted by
-            the metres that it gained, shape (...,).
-        stance_kept: of those, the feet whose soles were on the ground.
-        swing: the same of the feet that were to swing.
-        swing_kept: of those, the feet whose soles were above it.
+        stance: share of the feet in scheduled stance, summed over control steps, each step weighted
+            by the metres that it gained, shape (...,).
+        stance_kept: the same sum over those of these feet whose soles were on the ground.
+        swing: share of the feet in scheduled swing, summed like `stance`.
+        swing_kept: the same sum over those of these feet whose soles were above the ground.
     """
 
     nearest: Array
@@ -294,7 +294,7 @@ class Laikago(Plannable[LaikagoState]):
 
         The share of stance samples with the sole below 1 cm, and of swing samples with it above,
         over feet and control steps; each step is weighted by how much it lowered the smallest
-        distance to the goal so far, so that stepping on the spot does not whitewash a dash. The
+        distance to the goal so far, so that stepping on the spot does not hide a dash. The
         agreement is the mean of both: 0.5 for feet that are dragged, or never put down. 0 where no
         ground was gained in stance or in swing.
         """
@@ -351,16 +351,15 @@ class Laikago(Plannable[LaikagoState]):
         sums: Mapping[str, Array],
         steps: Array,
     ) -> dict[str, Array]:
-        """How the feet kept to the schedule, how soon the goal was reached, how fast and how well
-        the robot went, and what that cost.
+        """Footfall, time, speed, gait and cost of episodes.
 
-        footfall agreement: of its course (`footfall`).
-        time to the goal, s: from the start; only of episodes that arrived without a violation.
-        speed over the gait's bound: the mean along the straight line from the first position to
+        footfall agreement: `footfall` of the course.
+        time to the goal, s: from the start; only for episodes that arrived without a violation.
+        speed over the gait's bound: mean speed along the straight line from the first position to
             the last, over the planner's top speed.
-        gait: mean of r_ns r_ee_z r_ee_x, which is the reward without its distance.
-        cost of transport: `work` over weight times that line; of episodes that went as far as the
-            goal is wide.
+        gait: mean of r_ns r_ee_z r_ee_x, which is the reward without its factor of distance.
+        cost of transport: `work` over weight times the length of that line; only for lines longer
+            than the radius of the goal.
         """
         xp = array_namespace(last.base_position)
         seconds = steps * self.timestep

@@ -125,8 +125,8 @@ class Rocket(Plannable[RocketState]):
     imitation_forms = ("progress", "paper")
     measure_notes = MappingProxyType(
         {
-            "time away from the goal, s": "more than 1 m from it",
-            "impulse of the engines, N s": "what fuel is spent on; hovering costs 12.5 a second",
+            "time away from the goal, s": "time more than 1 m from the goal",
+            "impulse of the engines, N s": "use of fuel; hovering costs 12.5 a second",
         }
     )
     pushed = "rocket"
@@ -244,11 +244,11 @@ class Rocket(Plannable[RocketState]):
         sums: Mapping[str, Array],
         steps: Array,
     ) -> dict[str, Array]:
-        """How long the rocket was away from its goal, and what it spent.
+        """Time away from the goal, and use of the engines.
 
-        time away from the goal, s: more than a success's distance from it; what an episode that
-            ends early leaves of its horizon counts as away.
-        impulse of the engines, N s: of main and side engines, each as the integral of its force.
+        time away from the goal, s: time farther from the goal than a success may be. After an early
+            end the rest of the horizon counts as away.
+        impulse of the engines, N s: integral of the forces of the main and the side engines.
         """
         missing = self.timestep * (self.horizon - steps)
         found = {"time away from the goal, s": sums["away"] + missing}

@@ -22,7 +22,7 @@ from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR, Band, Rgb
 
 WIDTH = 11.0  # inches
 STYLE = {
-    "svg.fonttype": "none",  # text stays text
+    "svg.fonttype": "none",  # keeps text as text, which can be searched
     "font.family": "sans-serif",
     "font.size": 9.0,
     "axes.spines.top": False,
@@ -73,7 +73,7 @@ def contacts(bands: Sequence[Band], duration: float) -> str:
 
 
 def rewards(recording: Recording, plan: Recording | None) -> str:
-    """The terms of each step's reward, and their combination."""
+    """The reward of each step and its terms, executed beside planned."""
     names = list(recording.reward_terms)
     lines = [(EXECUTED_COLOUR, recording)]
     if plan is not None:
@@ -109,11 +109,11 @@ def joints(recording: Recording, plan: Recording) -> str:
 
 
 def robustness(surface: Surface, timestep: float) -> str:
-    """The share of pushes that are survived, and below that are recovered from, by force and
-    direction and by force and when.
+    """The shares of survived pushes (above) and of recovered pushes (below), by force and direction
+    (left) and by force and time (right).
 
     Args:
-        surface: every push, and what came of it.
+        surface: every push, with its outcome.
         timestep: seconds of a control step.
     """
     phases = [f"{phase * timestep:.2f}" for phase in surface.phases]
@@ -134,7 +134,7 @@ def robustness(surface: Surface, timestep: float) -> str:
             image = panel.imshow(
                 share, origin="lower", aspect="auto", vmin=0.0, vmax=1.0, cmap="cividis"
             )
-            every = -(-len(ticks) // 8)  # more would overlap
+            every = -(-len(ticks) // 8)  # more than eight labels would overlap
             panel.set_xticks(range(0, len(ticks), every), ticks[::every])
             panel.set_yticks(range(len(forces)), [f"{force:.3g}" for force in forces])
             panel.set(xlabel=label, ylabel="force, N")
@@ -159,7 +159,7 @@ def _figure(height: float) -> tuple[Figure, Axes]:
 
 
 def _panels(name: str, curves: Mapping[str, Sequence[Line]], columns: int) -> str:
-    """A grid of small charts over time, each with its title."""
+    """A grid of small charts over time, each under its title."""
     rows = -(-len(curves) // columns)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 1.5 * rows + 0.3), layout="constrained")

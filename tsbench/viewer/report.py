@@ -1,7 +1,7 @@
-"""The report of a run: one page that says what was planned, what was executed, and how good it is.
+"""The report of a run: one page with the plan, the executed motion and the score.
 
-It is made from the run's directory alone, and needs nothing else to be opened: the 3-D view and all
-charts are inside.
+The report is made from the run's directory alone. The page contains the 3-D view and all charts,
+and needs no other file.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR
 from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words, run_subject
 
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
-LEADING = 2  # measures that the verdict tells
+LEADING = 2  # number of measures that the sentences on the score give
 
 
 def write_pages(run: RunDirectory) -> None:
-    """Makes those of a finished run's `learning_curves.png`, `view.html` and `report.html` that
-    are missing.
+    """Makes the missing ones of a finished run's `learning_curves.png`, `view.html` and
+    `report.html`.
 
     Raises:
         TsbenchError: the run is not finished, a file in it is missing or damaged, or a page cannot
@@ -58,9 +58,10 @@ def render(run: RunDirectory) -> str:
 
 
 def check_finished(run: RunDirectory) -> None:
-    """
+    """Checks that a run has ended with a score.
+
     Raises:
-        TsbenchError: there is no finished run.
+        TsbenchError: the directory does not exist, or the run in it is not finished.
     """
     if not run.path.is_dir():
         raise TsbenchError(f"no run directory {run.path}")
@@ -70,7 +71,7 @@ def check_finished(run: RunDirectory) -> None:
 
 
 def _pages(run: RunDirectory) -> tuple[str, str]:
-    """The page with the 3-D view, and the report that has it inside."""
+    """The page with the 3-D view, and the report, which contains that page."""
     subject = run_subject(run)
     assert subject.policy is not None
     assert subject.score is not None
@@ -94,9 +95,9 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
 def _answers(subject: Subject, recording: Recording, plan: Recording | None) -> Iterator[str]:
     assert subject.score is not None
     score = subject.score.score
-    planned = "Nothing: this method learns to act directly, without a plan."
+    planned = "Nothing: this method trains a policy without a plan."
     if plan is not None:
-        planned = planned_in_words(plan) + " No physics binds it."
+        planned = planned_in_words(plan) + " A plan ignores physics."
     for kind, title, text in (
         ("plan", "What was planned", planned),
         ("executed", "What was executed", executed_in_words(recording)),
@@ -110,12 +111,12 @@ def _answers(subject: Subject, recording: Recording, plan: Recording | None) -> 
 
 
 def worth_in_words(score: Score, task: Task[Any]) -> str:
-    """What the score says, what matters most first."""
+    """The score in sentences, the main figures first."""
     perturbed, robustness = score.perturbed, score.robustness
     solved, spoiled = counts(perturbed)
     text = (
-        f"From {perturbed.episodes} starts a little different from the task's own the policy "
-        f"solves the task {solved} times; {spoiled} episodes are spoiled by {task.mishap}."
+        f"The policy solves the task from {solved} of {perturbed.episodes} perturbed starts. "
+        f"Spoiled by {task.mishap}: {spoiled} of {perturbed.episodes}."
     )
     for name, value in [*perturbed.measures.items()][:LEADING]:
         note = task.measure_notes.get(name)
@@ -123,10 +124,11 @@ def worth_in_words(score: Score, task: Task[Any]) -> str:
             text += f" {name[0].upper()}{name[1:]}: {number(value)}"
             text += f" ({note})." if note else "."
     text += (
-        f" It earns {score.normalized_reward:.1%} of the largest possible reward, "
-        f"{number(score.against_plan)} times what the best plan would. Of all pushes of "
-        f"{claim_force(score):.3g} N for {robustness.push_duration_s:g} s it survives "
-        f"{robustness.survival_100N:.0%}, and solves the task after {robustness.recovery_100N:.0%}."
+        f" The policy earns {score.normalized_reward:.1%} of the largest possible reward, which is "
+        f"{number(score.against_plan)} times the reward of the best plan. It survives "
+        f"{robustness.survival_100N:.0%} of all pushes of {claim_force(score):.3g} N for "
+        f"{robustness.push_duration_s:g} s. After {robustness.recovery_100N:.0%} of all it also "
+        "solves the task."
     )
     return text
 
@@ -144,49 +146,50 @@ def _sections(
         bands = foot_bands(plan or recording, recording)
         yield _section(
             "Foot contacts",
-            "Blue: when each foot was to stand on the ground. Orange: when it pressed on it, in "
-            f"full physics. {agreement_in_words(recording)}",
+            "Blue: the schedule, by which each foot stands on the ground. Orange: the contacts of "
+            f"the foot in full physics. {agreement_in_words(recording)}",
             charts.contacts(bands, duration),
         )
     yield _section(
         "Reward of each step",
-        "What the task pays, and the terms that it is made of. Blue: what the plan would earn if "
-        "it were followed exactly. Orange: what was executed.",
+        "The reward of the task and its terms. Blue: the reward of the plan, as if the robot "
+        "followed it exactly. Orange: the reward of the executed motion.",
         charts.rewards(recording, plan),
     )
     if plan is not None:
         yield _section(
             "Joints" if recording.task.drawing().feet else "Position and angle",
-            "Planned in blue, executed in orange; the typical error is the root of the mean "
-            "square, at equal times.",
+            "Blue: the plan. Orange: the executed motion. The typical error is the root mean "
+            "square of their difference at equal times.",
             charts.joints(recording, plan),
         )
     yield _section(
         "Robustness",
-        f"Pushes on its body, each tried once. Survived: the episode went on without "
-        f"{subject.task.mishap} and without straying. Recovered: the task was solved as well.",
+        f"Each push of the protocol acts on the robot's body once. Survived: the episode went on "
+        f"without {subject.task.mishap} and without straying. Recovered: the push was survived and "
+        "the task solved.",
         charts.robustness(subject.score.score.robustness.surface, subject.task.timestep),
     )
     if learning:
         yield _section(
             "How it learned",
-            "Return of the episodes during training, of each stage by the reward of that stage.",
+            "The return of training episodes. Each stage has its own reward.",
             learning,
         )
     yield _section(
         "Numbers",
-        f"Everything in this page comes from {run.path.name}/; the same score again: tsbench "
-        "evaluate. How the run was made is in config.yaml and versions.json.",
+        f"Everything on this page comes from {run.path.name}/. `tsbench evaluate` makes the score "
+        "again. config.yaml and versions.json tell how the run was made.",
         f'<div class="tables">{"".join(_tables(subject, run, plan))}</div>',
     )
 
 
 def agreement_in_words(recording: Recording) -> str:
-    """How often the feet did what the schedule asks for where each step ends."""
+    """A sentence on how often contact and schedule agree at the ends of control steps."""
     if recording.scheduled is None:
         return ""
     share = np.mean(recording.scheduled[1:] == recording.support.contacts[1:])
-    return f"They did as scheduled {share:.0%} of the time."
+    return f"Contacts and schedule agree {share:.0%} of the time."
 
 
 def _tables(subject: Subject, run: RunDirectory, planned: Recording | None) -> Iterator[str]:
@@ -217,12 +220,14 @@ def _tables(subject: Subject, run: RunDirectory, planned: Recording | None) -> I
 
 
 def _score_rows(subject: Subject, plan: Recording | None) -> Table:
-    """The figures of all episodes, beside what the reference motion would have."""
+    """The figures of all episodes, beside the figures of the reference motion."""
     assert subject.score is not None
     score, notes = subject.score.score, {**FIGURES, **subject.task.measure_notes}
     planned = {} if plan is None else plan.measures
     beside = ("reference motion",) if planned else ()
-    rows = [("score", f"{score.perturbed.episodes} other starts", "task's own start", *beside, "")]
+    rows = [
+        ("score", f"{score.perturbed.episodes} perturbed starts", "task's own start", *beside, "")
+    ]
     for name, value, own in episode_rows(score, subject.task):
         reference = (number(planned[name]) if name in planned else "",) if planned else ()
         rows.append((name, value, own, *reference, notes.get(name, "")))

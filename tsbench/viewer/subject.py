@@ -1,4 +1,4 @@
-"""What can be looked at: a run, a plan, a task, or two runs beside each other."""
+"""The subjects of the viewer: a run, a plan, a task, or two runs side by side."""
 
 from __future__ import annotations
 
@@ -26,14 +26,16 @@ from tsbench.viewer.show import Show
 
 @dataclass(frozen=True)
 class Subject:
-    """A task, with what was planned and learned for it.
+    """A task, with a policy or a plan for it.
+
+    A subject has a policy, a reference motion, or both.
 
     Attributes:
-        title: what it is.
-        task: that it is about.
-        policy: what executes it, if there is one.
-        reference: the plan as full poses, if there is one. One of the two there is.
-        score: the content of `score.json`, if there is one.
+        title: the title of its page.
+        task: the task.
+        policy: the policy, or None.
+        reference: the plan as full poses, or None.
+        score: the content of `score.json`, or None.
     """
 
     title: str
@@ -43,22 +45,24 @@ class Subject:
     score: Record | None = None
 
     def plan(self) -> Recording | None:
+        """The reference motion as a recording; None without one."""
         return None if self.reference is None else record_motion(self.task, self.reference)
 
     def show(self, push: str | None = None) -> Show:
-        """
+        """Plays the policy, or shows the plan of a subject without a policy.
+
         Args:
-            push: on the robot, as `parse_push` reads it.
+            push: a push on the robot, as `parse_push` reads it.
 
         Raises:
-            TsbenchError: a push on what no policy holds up, after the end or out of the task's
-                plane, or a policy for another task.
+            TsbenchError: the push acts on a plan, comes after the end of the episode or leaves the
+                task's plane, or the policy is for another task.
         """
         force = None if push is None else parse_push(push, self.task)
         plan = self.plan()
         if self.policy is None:
             if force is not None:
-                raise TsbenchError("only what a policy executes can be pushed, not a plan")
+                raise TsbenchError("a plan cannot be pushed, only a policy")
             assert plan is not None
             return compose_plan(plan, title=self.title, verdict=planned_in_words(plan))
         recording = record_episode(self.task, self.policy, force)
@@ -66,7 +70,7 @@ class Subject:
         return self.show_of(recording, plan)
 
     def show_of(self, recording: Recording, plan: Recording | None) -> Show:
-        """What was executed beside what was planned."""
+        """The executed motion beside the plan."""
         sentences = [] if plan is None else [planned_in_words(plan)]
         return compose(
             recording,
@@ -78,10 +82,11 @@ class Subject:
 
 
 def subject(word: str) -> Subject:
-    """What a word of the command line names: task=NAME, a run's directory, or a plan's file.
+    """The subject that a word of the command line names: task=NAME, a run's directory, or a plan's
+    file.
 
     Raises:
-        TsbenchError: it names nothing, or what is there is damaged.
+        TsbenchError: the task, directory or file does not exist, or is damaged.
     """
     if word.startswith("task="):
         return task_subject(tasks.make(word.removeprefix("task=")))
@@ -92,17 +97,18 @@ def subject(word: str) -> Subject:
 
 
 def task_subject(task: Task[Any]) -> Subject:
-    """A task, shown by the plan that its hand-made planner makes."""
+    """A task with the plan of its hand-made planner."""
     title = f"{task.name}, planned by hand"
     planned = plannable(task)
     return Subject(title, task, None, planned.reference(naive_plan(planned)))
 
 
 def run_subject(run: RunDirectory) -> Subject:
-    """A run, of which nothing but the policy must be there.
+    """A run. Only its policy is required.
 
     Raises:
-        TsbenchError: there is no such directory, or a file in it is missing or damaged.
+        TsbenchError: the directory does not exist, its policy is missing, or a file in it is
+            damaged.
     """
     policy = run.policy()
     task = run.task(policy.info.task)
@@ -117,10 +123,11 @@ def run_subject(run: RunDirectory) -> Subject:
 
 
 def plan_subject(path: Path) -> Subject:
-    """A plan or reference motion, with the constants of the run in whose directory it lies.
+    """A plan or reference motion, with the constants of the run in whose directory the file lies.
 
     Raises:
-        TsbenchError: the file is neither, damaged, or for another version of its task.
+        TsbenchError: the file is damaged, holds neither a plan nor a reference motion, or is for
+            another version of its task.
     """
     motion = read_motion(path)
     task = plannable(RunDirectory(path.parent).task(motion.task))
@@ -131,11 +138,11 @@ def plan_subject(path: Path) -> Subject:
 
 
 def pair(runs: Sequence[str], push: str | None = None) -> Show:
-    """Two runs of one task beside each other.
+    """Two runs of one task side by side.
 
     Raises:
-        TsbenchError: they are for different tasks, one of them is damaged, or the push comes after
-            the end of both.
+        TsbenchError: the runs are for different tasks, one of them is damaged, or the push comes
+            after the end of both episodes.
     """
     subjects = [run_subject(RunDirectory(Path(word))) for word in runs]
     force = None if push is None else parse_push(push, subjects[0].task)
@@ -151,9 +158,10 @@ def pair(runs: Sequence[str], push: str | None = None) -> Show:
 
 
 def check_pushed(push: Push | None, recordings: Sequence[Recording]) -> None:
-    """
+    """Checks that a push comes before the end of at least one episode.
+
     Raises:
-        TsbenchError: the push comes when every episode has ended, so that nobody would see it.
+        TsbenchError: every episode ends before the push.
     """
     end = max(recording.duration for recording in recordings)
     if push is not None and (begins := float(np.min(push.time))) >= end:
@@ -161,6 +169,7 @@ def check_pushed(push: Push | None, recordings: Sequence[Recording]) -> None:
 
 
 def planned_in_words(plan: Recording) -> str:
+    """A sentence on the course of a plan."""
     distance = plan.goal_distance
     return (
         f"The plan starts {distance[0]:.2f} m from the goal and ends {distance[-1]:.2f} m from it "
@@ -169,6 +178,7 @@ def planned_in_words(plan: Recording) -> str:
 
 
 def executed_in_words(recording: Recording) -> str:
+    """A sentence on the end of an executed episode."""
     end = f"{recording.goal_distance[-1]:.2f} m from the goal after {recording.duration:.1f} s"
     if recording.violated:
         return f"In full physics the policy ends {end}, spoiled by {recording.task.mishap}."
