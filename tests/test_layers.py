@@ -49,6 +49,7 @@ ONLY_IN: dict[str, set[str]] = {
     "safetensors": {"core.policy", "runs.checkpoint"},
     "hydra": {"runs.config", "cli.launch"},
     "omegaconf": {"runs.config", "cli.launch"},
+    "jinja2": {"leaderboard"},
     "meshcat": {"viewer"},
     "matplotlib": {"viewer"},
     "pytest": {"testing"},

@@ -663,6 +663,33 @@ def _verify(words: Sequence[str]) -> int:
     return int(bool(faults) or not all(verdict.passed for verdict in verdicts))
 
 
+def _leaderboard(words: Sequence[str]) -> None:
+    parser = _parser("leaderboard", json=False)
+    flag = parser.add_argument
+    flag("--board", type=Path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--html", type=Path, metavar="DIRECTORY", help="write the site there")
+    flag("--plain", action="store_true", help="a site without 3-D views and figures, in seconds")
+    flag("--readme", action="store_true", help="write the tables into README.md of the board")
+    options = parser.parse_args(words)
+    from tsbench.core.errors import os_errors
+    from tsbench.core.files import write_whole
+    from tsbench.leaderboard import page
+    from tsbench.viewer import report
+
+    if options.html:
+        render = None if options.plain else report.render
+        written = page.write_site(options.board, options.html, render, _tell(Console(stderr=True)))
+        sys.stdout.write(f"{written[0]}\n")
+    if options.readme or not options.html:
+        readme = options.board / "README.md"
+        with os_errors(readme):
+            before = readme.read_text(encoding="utf-8") if readme.exists() else "# Leaderboards\n"
+            text = page.markdown(*page.tables(options.board), before.partition("\n## ")[0])
+            if options.readme:
+                write_whole(readme, text.encode())
+        sys.stdout.write(f"{readme}\n" if options.readme else text.partition("\n## ")[2])
+
+
 def _tell(console: Console) -> Callable[[str], None]:
     return lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True)
 
@@ -709,6 +736,7 @@ VERBS = {
     "export": Verb("write a policy of another library as tsbench's own file", _export),
     "submit": Verb("pack runs into an entry of the leaderboard", _submit),
     "verify": Verb("check whether entries of the leaderboard hold what they claim", _verify),
+    "leaderboard": Verb("show the leaderboard: as tables, or as a site", _leaderboard),
     "bench": Verb("measure speed, beside alternatives", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }

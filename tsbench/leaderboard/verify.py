@@ -372,12 +372,12 @@ def comment(verdicts: Sequence[Verdict], faults: Sequence[str]) -> str:
     """Markdown for a pull request: claimed, verified, difference, and the reasons."""
     lines = ["## Leaderboard: what the verifier of `main` found", ""]
     if faults:
-        lines += ["**Not verified.**", "", *(f"- {_plain(fault)}" for fault in faults)]
+        lines += ["**Not verified.**", "", *(f"- {as_markdown(fault)}" for fault in faults)]
     for verdict in verdicts:
         state = f"{verdict.state or 'refused'}, {'passed' if verdict.passed else '**failed**'}"
         lines += [
             "",
-            f"### {_plain(verdict.entry)}: {state} ({verdict.seconds:.0f} s)",
+            f"### {as_markdown(verdict.entry)}: {state} ({verdict.seconds:.0f} s)",
             "",
             "| seed | figure | claimed | verified | difference |",
             "|---|---|---|---|---|",
@@ -389,10 +389,10 @@ def comment(verdicts: Sequence[Verdict], faults: Sequence[str]) -> str:
             lines.append(
                 f"| {one.seed} | {one.name} | {one.claimed:.6g} | {verified} | {difference} |"
             )
-        lines += ["", *(f"- {_plain(reason)}" for reason in verdict.reasons)]
+        lines += ["", *(f"- {as_markdown(reason)}" for reason in verdict.reasons)]
     return "\n".join(lines)[:60_000] + "\n"
 
 
-def _plain(text: str) -> str:
+def as_markdown(text: str) -> str:
     """Text of a submission as Markdown that is nothing but text: no link, mention or markup."""
     return re.sub(r"([^\w\s.,;:()/%+-])", lambda found: f"&#{ord(found[1])};", plain_line(text))
