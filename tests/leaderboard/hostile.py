@@ -430,6 +430,19 @@ SCORE: dict[str, list[Any]] = {
     "score/origin/task": ["cooking"], "score/origin/packages": [[], {"mujoco": 3}],
     "score/origin/machine": [None], "more": [1],
 }  # fmt: skip
+EDGES: dict[str, list[Any]] = {  # of numbers, for who draws them
+    "score/robustness/surface/forces_N": [[0.0] * 12, [1e308] * 12, [-1.0] * 12, [5e-324] * 12],
+    "score/robustness/surface/headings_rad": [[1e308] * 16, [0.0] * 16],
+    "score/robustness/surface/phases": [[2**62] * 16, [-1] * 16, [0] * 16],
+    "score/robustness/push_duration_s": [0.0, 1e308, -0.0],
+    "score/robustness/mass_scale": [0.0, 1e308],
+    "score/robustness/survival_impulse_50": [1e308, -1e308],
+    "score/origin/protocol/claim": [0.0, 1e308], "score/origin/protocol/headings": [0, 2**62],
+    "score/origin/protocol/duration": [0.0], "score/origin/protocol/forces": [[], [0.0]],
+    "score/perturbed/goal_distance": [1e308], "score/perturbed/measures": [{"$x^$": 1e308}],
+    "score/nominal/steps": [1e308], "stages/0/name": ["$\\frac", "<b>", ""],
+    "stages/0/seconds": [1e300], "stages/0/steps": [2**63],
+}  # fmt: skip
 MANIFEST: dict[str, list[Any]] = {
     "schema": [2, "1", None, 2**70], "described/entry": ["other", "../entry", "", "A", "x" * 65],
     "described/authors": [[], [""], ["x" * 301], ["\x1b[31m"], ["a"] * 101, [3]],
@@ -567,6 +580,14 @@ def run_cases(verbs: list[str], contents: bool) -> Iterator[tuple[str, str, Chan
                     yield verb, f"{verb} {name}: {what}", written(name, content)
 
 
+def score_cases() -> Iterator[tuple[str, str, Change]]:
+    """Scores that are not what a policy earns, or cannot be, as the report meets them. What it can
+    show it shows: nobody says that it is true."""
+    for place, values in {**SCORE, **EDGES}.items():
+        for i, value in enumerate(values):
+            yield "report", f"report score.json {place} {i}", altered("score.json", place, value)
+
+
 def words_of(verb: str, run: Path, out: Path) -> list[str]:
     if verb == "resume":
         (run / "score.json").unlink(missing_ok=True)
@@ -647,7 +668,8 @@ def entries(folder: Path) -> None:
 def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> None:
     whole = intact(folder / "whole") / "seed0"
     (whole / "metrics.jsonl").write_text('{"stage": "plan", "steps": 1, "episode_return": 1.0}\n')
-    for verb, case, change in run_cases([chosen] if chosen else [*READ_BY], only is None):
+    found = run_cases([chosen] if chosen else [*READ_BY], only is None)
+    for verb, case, change in score_cases() if only == "scores" else found:
         out = Path(tempfile.mkdtemp(dir=folder))
         run = out / "a" / "b" / "run"
         shutil.copytree(whole, run)
@@ -725,9 +747,7 @@ def main() -> None:
     parser.add_argument("count", nargs="?", type=int, default=300)
     parser.add_argument("--start", type=int, default=0, help="of the random numbers")
     parser.add_argument("--verb", choices=READ_BY, help="of the runs, one alone")
-    parser.add_argument(
-        "--only", choices=("kinds",), help="no content that a parser might choke on"
-    )
+    parser.add_argument("--only", choices=("kinds", "scores"), help="of the runs")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="hostile-") as folder:
         os.chdir(folder)

@@ -70,6 +70,7 @@ def test_random_changes_of_an_entry() -> None:
 def test_no_hostile_run_is_read(verb: str) -> None:
     found = cases("runs", "--verb", verb, "--only", "kinds")
     assert len(found) >= 20
-    for case in found:
-        check_refused(case | {"MB": 0})  # beside mujoco, some of these load torch or matplotlib
+    # The first one loads what its verb needs; beside mujoco some load torch or matplotlib.
+    for case in [found[0] | {"seconds": 0.0}, *found[1:]]:
+        check_refused(case | {"MB": 0})
         assert case["line"].startswith("2 tsbench: "), case
