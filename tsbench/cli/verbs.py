@@ -144,7 +144,7 @@ def _check_graphics() -> None:
 
 
 def _help() -> str:
-    verbs = "\n".join(f"  {name:<10}{verb.summary}" for name, verb in VERBS.items())
+    verbs = "\n".join(f"  {name:<13}{verb.summary}" for name, verb in VERBS.items())
     return f"""\
 usage: tsbench COMMAND ...
 
