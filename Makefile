@@ -5,6 +5,7 @@
 # make faults   set up, then kill, starve and poison runs: N=50 kills, and every other fault once
 # make bench    measure speed
 # make compare  measure speed beside other libraries, such as ARGS='--only sb3'
+# make gpu-bundle  collect what a machine with a GPU and without a network lacks
 # make clean    remove the files that make and the tests have made, but not runs/
 #
 # `make run` hands its key=value words to `tsbench run`. Words in capitals are for make: ARGS holds
@@ -30,7 +31,7 @@ quoted = '$(subst ','\'',$(call plain,$1))'
 given = $(filter-out ARGS=% PYTHON=% N=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
 words = $(if $(filter task=%,$(given)),,task=laikago_trot) $(foreach word,$(given),$(call quoted,$(word)))
 
-.PHONY: help setup system run test check format faults bench compare clean
+.PHONY: help setup system run test check format faults bench compare gpu-bundle clean
 
 help:
 	@sed -n 's/^# \(make .*\)/  \1/p' Makefile
@@ -78,6 +79,9 @@ bench: setup
 
 compare: setup $(EXTRAS)
 	@$(BIN)/python benchmarks/compare.py $(ARGS)
+
+gpu-bundle: setup
+	@$(BIN)/python benchmarks/bundle.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) build dist screenshots .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tsbench import bench, tasks
-from tsbench.bench import Comparison, Findings, scaling, stepping, training
+from tsbench.bench import Comparison, Findings, gpu, scaling, stepping, training
 from tsbench.bench.domains import domains, planned, richest
 from tsbench.bench.training import split
 from tsbench.bench.turns import Case, Effort, Range, take_turns
@@ -53,7 +54,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sb3, "PATIENCE", 0.0)
 
 
-@pytest.mark.parametrize("name", bench.names())
+@pytest.mark.parametrize("name", sorted({*bench.names()} - {"gpu"}))  # it has tests below
 def test_every_comparison(name: str) -> None:
     """Comparisons whose packages are missing say so; the others measure something."""
     findings = bench.measure(name, quick=True)
@@ -238,3 +239,24 @@ def test_a_training_is_split_without_rest() -> None:
     for part, (least, most) in expected.items():
         found = findings.ratios[f"x.{part}/whole"]
         assert (found.least, found.most) == pytest.approx((least, most))
+
+
+def test_the_gpu_comparison_says_that_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    findings = bench.measure("gpu")
+    assert not findings.figures
+    (line,) = findings.notes
+    assert line.startswith("gpu: not measured, device=cuda")
+    assert "gpu" not in [name for name in bench.names() if not bench.find(name).named]
+
+
+def test_rates_on_a_device_are_of_whole_environments(capsys: pytest.CaptureFixture[str]) -> None:
+    task = tasks.make("rocket_obstacles")
+    found = dict(gpu.rates(task, "warp", (2, 3), 0.01, on_cpu=4))
+    names = [f"{kind}.{count}" for count in (2, 3) for kind in ("physics", "environment")]
+    assert list(found) == [*names, "environment.4.cpu"]
+    assert all(figure.least > 0.0 for figure in found.values())
+    findings = Findings()
+    gpu.note(findings, "rocket.physics.2", found["physics.2"])
+    assert findings.figures["rocket.physics.2"].unit == "steps/s"
+    assert capsys.readouterr().out.startswith("rocket.physics.2: ")

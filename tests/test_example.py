@@ -130,7 +130,7 @@ def test_the_example_is_installed_used_and_removed(
         installation.pip("install", built(source, tmp_path / name))
 
     content = installation.listed()
-    assert content["plug-ins"] == {"planar-puck 0.1.0": ["puck_gap", "by_hand"]}
+    assert content["plug-ins"] == {"planar-puck 0.1.0": ["puck_gap", "by_hand", "random_search"]}
     assert content["refused"] == []
     where = installation.succeed("python", "-c", "import tsbench; print(tsbench.__file__)")
     assert where.startswith(str(installation.venv))
@@ -138,9 +138,12 @@ def test_the_example_is_installed_used_and_removed(
     answers = {}
     for command in commands("Try it"):
         answers[command] = installation.succeed(*command.split())
-    assert all(name in answers["tsbench list"] for name in ("puck_gap", "by_hand", "planar-puck"))
+    assert all(
+        name in answers["tsbench list"]
+        for name in ("puck_gap", "by_hand", "random_search", "planar-puck")
+    )
     assert "compared bit for bit: equal" in answers[f"tsbench evaluate {RUN}"]
-    for method in ("by_hand", "twostage"):
+    for method in ("by_hand", "random_search", "twostage"):
         run = installation.folder / "runs" / "puck_gap" / method / "seed0-smoke"
         score = json.loads((run / "score.json").read_text())
         assert (score["task"], score["method"]) == ("puck_gap", method)
@@ -155,7 +158,7 @@ def test_the_example_is_installed_used_and_removed(
     content = installation.listed()
     assert content["plug-ins"] == {}
     assert "puck_gap" not in content["tasks"]
-    assert "by_hand" not in content["methods"]
+    assert not {"by_hand", "random_search"} & set(content["methods"])
     done = installation.run("tsbench", "evaluate", RUN)
     assert done.returncode == 2
     assert re.fullmatch(r"tsbench: unknown task 'puck_gap'; allowed: .*\n", done.stderr)

@@ -37,7 +37,9 @@ ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 
 # The rooms, or single files of rooms, that may import each package.
 ONLY_IN: dict[str, set[str]] = {
-    "torch": {"rl", "testing"},
+    "torch": {"rl", "sim.device", "sim.warp", "bench.gpu", "testing"},
+    "warp": {"sim.warp"},
+    "mujoco_warp": {"sim.warp"},
     "rsl_rl": {"rl", "testing"},
     "tensordict": {"rl"},
     "threadpoolctl": {"rl", "evaluation.origin"},
@@ -47,6 +49,7 @@ ONLY_IN: dict[str, set[str]] = {
     "dm_env": {"sim", "testing"},
     "mujoco": {"core.task", "planning", "sim", "tasks", "viewer", "bench", "cli.verbs"},
     "safetensors": {"core.policy", "runs.checkpoint"},
+    "optuna": {"runs.tune"},
     "hydra": {"runs.config", "cli.launch"},
     "omegaconf": {"runs.config", "cli.launch"},
     "jinja2": {"leaderboard"},
@@ -150,7 +153,7 @@ def test_evaluation_needs_no_learning() -> None:
     program = (
         "import sys, tsbench, tsbench.evaluation.evaluate, tsbench.core.policy, tsbench.methods\n"
         "tsbench.load('rocket_navigation').reset()\n"
-        "print(*sorted({'torch', 'rsl_rl', 'hydra', 'meshcat'} & set(sys.modules)))"
+        "print(*sorted({'torch', 'rsl_rl', 'hydra', 'meshcat', 'warp'} & set(sys.modules)))"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT.parent

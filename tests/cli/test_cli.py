@@ -83,8 +83,11 @@ def test_list_shows_tasks_without_a_configuration(
         return tasks.make(tasks.names()[0])
 
     assert verbs.main(["list"]) == 0
-    row = next(line for line in capsys.readouterr().out.splitlines() if "stroll" in line)
+    lines = capsys.readouterr().out.splitlines()
+    row = next(line for line in lines if "stroll" in line)
     assert row.count("-") == 3
+    lack = "the task 'stroll' cannot be run: its package lacks conf/task/stroll.yaml"
+    assert f"Incomplete: {lack}" in lines
 
 
 def test_list_is_quick_because_it_leaves_learning_alone() -> None:
@@ -190,7 +193,7 @@ def test_the_configuration_can_be_shown(capsys: pytest.CaptureFixture[str], tmp_
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("tsbench ", "run evaluate view report export submit verify leaderboard bench list"),
+        ("tsbench ", "run evaluate view report tune export submit verify leaderboard bench list"),
         ("tsbench run task=rocket_n", "task=rocket_navigation"),
         ("tsbench run task=rocket_navigation bud", "budget="),
     ],

@@ -234,6 +234,30 @@ def test_a_missing_configuration(part: str, toy: Toy, tmp_path: Path) -> None:
     kind, name = part.split("/")
     line = f"tsbench: the {kind} {name!r} cannot be run: its package lacks conf/{part}.yaml\n"
     assert (done.returncode, done.stderr) == (2, line)
+    assert listed(tmp_path)["incomplete"] == [line.removeprefix("tsbench: ").strip()]
+
+
+def test_a_broken_promise_is_listed_and_refused(toy: Toy, tmp_path: Path) -> None:
+    assert listed(tmp_path)["incomplete"] == []
+    source = TASK.replace("class Flight(Rocket):", 'class Flight(Rocket):\n    pushed = "roket"')
+    (toy.folder / "task.py").write_text(source)
+    (line,) = listed(tmp_path)["incomplete"]
+    assert line.startswith("unknown body `pushed` of the task toy_flight 'roket'; allowed: ")
+    done = call(tmp_path, *RUN)
+    assert (done.returncode, done.stderr) == (2, f"tsbench: {line}\n")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_configuration_of_another_name(toy: Toy, tmp_path: Path) -> None:
+    """It is told by `tsbench run` and by `tsbench list`, which goes on to show the others."""
+    file = toy.folder / "conf" / "task" / "toy_flight.yaml"
+    file.write_text(file.read_text().replace("name: toy_flight", "name: flight"))
+    line = "conf/task/toy_flight.yaml must have name: toy_flight, not flight"
+    done = call(tmp_path, *RUN)
+    assert (done.returncode, done.stderr) == (2, f"tsbench: {line}\n")
+    content = listed(tmp_path)
+    assert content["incomplete"] == [line]
+    assert content["tasks"].keys() == set(tasks.names())
 
 
 @pytest.mark.parametrize("file", ["__init__.py", "task.py"])
@@ -266,6 +290,14 @@ def test_a_broken_method_is_told_when_it_is_used(toy: Toy, tmp_path: Path) -> No
     )
     done = call(tmp_path, "run", f"task={SOME}", "--cfg", "job")
     assert done.returncode == 0, done.stderr
+
+
+def test_a_method_that_returns_no_policy(toy: Toy, tmp_path: Path) -> None:
+    (toy.folder / "lazy.py").write_text(METHOD.replace("    return replace", "    replace"))
+    done = call(tmp_path, *QUICK)
+    assert done.returncode == 2
+    line = "tsbench: the method lazy returns NoneType, not a Policy"
+    assert done.stderr.splitlines()[-1].startswith(line)
 
 
 def test_a_missing_module_and_a_single_one(toy: Toy, tmp_path: Path) -> None:

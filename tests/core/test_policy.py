@@ -173,6 +173,13 @@ def refused(directory: Path, *words: str) -> None:
         assert word in message
 
 
+def test_arrays_in_double_precision_are_not_saved(saved: Path, tmp_path: Path) -> None:
+    loaded = Policy.load(saved)
+    double = replace(loaded, mean=loaded.mean.astype(np.float64))
+    with pytest.raises(TsbenchError, match=r"^the arrays of a policy are float32, not float64$"):
+        double.save(tmp_path / "double")
+
+
 @pytest.mark.parametrize("name", ["policy.json", "policy.safetensors"])
 def test_a_missing_file(saved: Path, name: str) -> None:
     (saved / name).unlink()

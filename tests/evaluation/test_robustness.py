@@ -184,7 +184,7 @@ def test_a_push_played_from_its_moment_is_the_whole_episode(
     outcome = pushed(policy, task, forces, phases, SMALL, threads=1)
     survived = outcome.survived
     assert survived.shape == outcome.recovered.shape == (2, 3, len(phases))
-    monkeypatch.setattr("tsbench.evaluation.robustness._BLOCK", 5)
+    monkeypatch.setattr(Physics, "side_by_side", 5)
     in_blocks = pushed(policy, task, forces, phases, SMALL, threads=1)
     np.testing.assert_array_equal(in_blocks.survived, survived)
     np.testing.assert_array_equal(in_blocks.recovered, outcome.recovered)

@@ -236,7 +236,7 @@ def test_the_artefact_is_the_actor(encoding: str) -> None:
     policy = taught.policy(tasks.make("rocket_navigation", distance=3.0), "test")
     assert policy.info.layers == (7, 16, 3)
     assert (policy.info.task, policy.info.method) == ("rocket_navigation", "test")
-    environment = TorchEnvironment(taught.environment, encoding)
+    environment = TorchEnvironment(cast(Any, taught.environment), encoding)
     actor = taught._actor
     actor.eval()
     with torch.inference_mode():
@@ -360,7 +360,7 @@ def test_a_learner_is_told_of_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
         returns += running[dones == 1].tolist()
         running[dones == 1] = 0.0
     assert arrivals > 8
-    np.testing.assert_allclose(list(taught._returns), returns[-100:], rtol=1e-5)
+    np.testing.assert_allclose(list(cast(Any, taught._env)._returns), returns[-100:], rtol=1e-5)
 
 
 # Settings

@@ -52,6 +52,33 @@ def test_words_change_values_and_open_mappings_need_no_plus() -> None:
     assert chosen.task.budgets["smoke"].act == 2000
 
 
+@pytest.mark.parametrize("name", tasks.names())
+def test_a_gpu_makes_the_changes_of_the_task_file(name: str) -> None:
+    """Each of them, in every budget and kind of stage; the same file says nothing to a CPU."""
+    on_cpu = config.compose([f"task={name}"]).task
+    on_gpu = config.compose([f"task={name}", "device=cuda"]).task
+    assert on_gpu.gpu.training
+    assert on_gpu.training != on_cpu.training
+    for kind in on_cpu.training:
+        assert on_gpu.training[kind] == {
+            **on_cpu.training[kind],
+            **on_gpu.gpu.training.get(kind, {}),
+        }
+    for budget, steps in on_cpu.budgets.items():
+        assert vars(on_gpu.budgets[budget]) == {**vars(steps), **on_gpu.gpu.budgets.get(budget, {})}
+    assert config.compose([f"task={name}", "device=warp"]).task == on_cpu
+
+
+def test_words_win_over_the_changes_for_a_gpu() -> None:
+    words = [TASK, "device=cuda:1", "task.training.plan.environments=32"]
+    assert config.compose(words).task.training["plan"]["environments"] == 32
+    words = [TASK, "device=cuda", "task.gpu.training.plan.environments=77"]
+    assert config.compose(words).task.training["plan"]["environments"] == 77
+    words = [TASK, "device=cuda", "task.training.imitate={rollout: 7}"]
+    imitate = config.compose(words).task.training["imitate"]
+    assert (imitate["rollout"], imitate["environments"]) == (7, 32)  # Hydra merges
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -64,7 +91,7 @@ def test_words_change_values_and_open_mappings_need_no_plus() -> None:
         ([TASK, "~method"], "method is missing"),
         (
             [TASK, "sed=1"],
-            "unknown key 'sed'; allowed: budget, checkpoint, directory, method, seed, ",
+            "unknown key 'sed'; allowed: budget, checkpoint, deterministic, device, directory, ",
         ),
         ([TASK, "sed=1"], "(did you mean 'seed'?)"),
         ([TASK, "+extra=1"], "unknown key 'extra'"),
@@ -79,6 +106,8 @@ def test_words_change_values_and_open_mappings_need_no_plus() -> None:
         ([TASK, "threads=0"], "threads must be at least 1, not 0"),
         ([TASK, "checkpoint=-1"], "checkpoint must not be negative, not -1.0"),
         ([TASK, "checkpoint=nan"], "checkpoint must not be negative, not nan"),
+        ([TASK, "device=gpu"], "device must be one of cpu, cuda, cuda:N, auto, warp, not 'gpu'"),
+        ([TASK, "deterministic=true"], "deterministic: true is for a GPU; on the CPU every run is"),
         ([TASK, "budget=fats"], "unknown budget 'fats'; allowed: fast, paper, smoke"),
         ([TASK, "budget=1"], "budget must be text, not 1"),
         ([TASK, "task.budgets.smoke.audit=skip"], "task.budgets.smoke.audit must be stop or warn"),

@@ -251,7 +251,7 @@ def test_another_physics_is_played_beside(
         "recovered, pushes": 2 * 4 * 2,
     }
     assert cli.main(["evaluate", "one", "--physics", "round"]) == 2
-    assert "unknown physics 'round'; allowed: elliptic, half_step" in capsys.readouterr().err
+    assert "unknown physics 'round'; allowed: elliptic, half_step, warp" in capsys.readouterr().err
 
 
 def test_evaluate_replays_where_the_machine_differs(

@@ -91,9 +91,6 @@ class Cart(Task[CartState]):
         x = rng.uniform(-0.1, 0.1, (count, 1)) if perturbed else np.zeros((count, 1))
         return Start(np.zeros(count), x, np.zeros((count, 1)), np.zeros((count, 0)))
 
-    def control(self, state: CartState, action: Array) -> tuple[Array, Array]:
-        return array_namespace(action).clip(action, -1.0, 1.0), self.memory(state)
-
     def read(self, readings: Readings) -> CartState:
         return CartState(readings.time, readings.qpos[..., 0], readings.qvel[..., 0])
 

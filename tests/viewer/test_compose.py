@@ -12,7 +12,7 @@ import pytest
 from tsbench import tasks
 from tsbench.core.drawing import Drawing
 from tsbench.core.errors import TsbenchError
-from tsbench.core.motion import ReferenceMotion
+from tsbench.core.motion import ReferenceMotion, Roadmap
 from tsbench.viewer.compose import compose, compose_pair, compose_plan, spans
 from tsbench.viewer.pushes import parse_push
 from tsbench.viewer.recording import Recording, record_episode, record_motion
@@ -137,6 +137,34 @@ def test_only_flat_worlds_have_drawn_bounds() -> None:
     corners = np.zeros(3), np.array([1.0, 2.0, 3.0])
     with pytest.raises(TsbenchError, match="flat"):
         furnish(furnished, Drawing(bounds=corners), 1.0)
+
+
+def test_a_roadmap_is_drawn_where_it_is() -> None:
+    """Each edge is a thin tube from node to node, the way a thicker one; no contact with either."""
+    nodes = np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 10.0], [20.0, 0.0, 0.0], [5.0, 0.0, 5.0]])
+    edges = np.array([[0, 3], [1, 2], [0, 1]])  # the shortest is drawn first
+    path = np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 10.0]])
+    task = tasks.make("rocket_obstacles")
+    roadmap = Roadmap(task.name, task.version, 0.05, nodes, edges, path, checked=9)
+    show = compose(flies(0.7, 0.0), None, title="", roadmap=roadmap)
+    assert {"roadmap", "way"} <= {entry.name for entry in show.legend}
+    model, data = show.model, mujoco.MjData(show.model)
+    mujoco.mj_kinematics(model, data)
+    width = []
+    for number, ends in enumerate((nodes[edges], path[None])):
+        geom = model.geom(f"lines_{number}")
+        assert geom.contype[0] == geom.conaffinity[0] == 0
+        mesh = model.mesh(f"lines_{number}")
+        first, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
+        placed = data.geom(f"lines_{number}")
+        vertices = model.mesh_vert[first : first + count] @ placed.xmat.reshape(3, 3).T
+        vertices = (vertices + placed.xpos).reshape(len(ends), 2, 3, 3)
+        np.testing.assert_allclose(vertices.mean(axis=2), ends, atol=1e-3)
+        width.append(np.linalg.norm(vertices - ends[:, :, None], axis=-1).max())
+    assert 0.0 < width[0] < width[1] < 0.05
+    plain = compose(flies(0.7, 0.0), None, title="")
+    assert "roadmap" not in {entry.name for entry in plain.legend}
+    assert plain.model.nmesh == model.nmesh - 2
 
 
 def test_a_plan_alone(plan: Recording) -> None:

@@ -28,6 +28,7 @@ from rich.console import Console
 from tsbench.cli import tables
 from tsbench.core.errors import Stopped, TsbenchError, memory_errors
 from tsbench.core.files import write_json
+from tsbench.rl import processes
 from tsbench.runs import config, execute
 from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory, shown
@@ -61,12 +62,17 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
         _show(flags, parser)
         return
     elif flags.multirun:
+        if processes.count() > 1:
+            raise TsbenchError("a sweep's runs have one process each: start it without torchrun")
         if json is not None:
             raise TsbenchError("--json is for one run; each of a sweep's has its score.json")
         _sweep(flags.overrides)
         return
     else:
         chosen = placed(config.compose(flags.overrides), flags.overrides)
+        if processes.rank():
+            execute.assist(chosen)
+            return
         execute.execute(chosen, _own(flags.overrides))
         place = Path(chosen.directory or "")
         finish(place)
@@ -178,7 +184,7 @@ class _Job:
     def __call__(self, node: DictConfig) -> float:
         """Completes a run and its pages. Returns its normalized reward, NaN if it failed."""
         words = list(HydraConfig.get().overrides.task)
-        chosen = placed(config.parse(node), words)
+        chosen = placed(config.parse(node, config.keys(words)), words)
         place = RunDirectory(Path(chosen.directory or ""))
         try:
             reward = execute.complete(chosen, words)

@@ -33,6 +33,9 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
+  device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
+  deterministic=true
+                   the same bits each time on a GPU, for more time
   resume=RUN       continues an interrupted run to the same result, bit for bit; takes no other
                    words
   method.KEY=...   an option of the method
@@ -52,6 +55,24 @@ examples:
   tsbench run -m task=laikago_walk,laikago_trot 'seed=range(0,3)'
 """
 
+
+TUNE_HELP = """\
+usage: tsbench tune task=NAME method=NAME trials=N [study=PATH] [key=value ...] [options]
+
+Finds good settings of a method by Optuna's multivariate TPE, and prints the words of the best ones.
+Processes that are given the same words work on one study together, and a study goes on where it
+was interrupted. docs/tuning.md says what a trial is and what it is worth.
+
+words:
+  trials=N         trials of the whole study, pruned and failed ones among them
+  study=PATH       directory of the journal and the runs (studies/TASK/METHOD-BUDGET)
+  task=, method=, budget=, threads=, key=value
+                   as of `tsbench run`, for all trials; a key that is given is not tuned
+
+options:
+  --best           only print the words of the best trial so far
+  --json FILE      write them to a new JSON file too, with the number of trials spent
+"""
 
 JSON_HELP = "write what is shown to a new JSON file too"
 PICTURES = ("--video", "--strip")  # options that need OpenGL
@@ -193,9 +214,16 @@ def _list(words: Sequence[str]) -> None:
     from tsbench.core import plugins
     from tsbench.core.files import write_json
     from tsbench.runs import config
+    from tsbench.sim.promises import check_promises
 
-    made = {name: tasks.make(name) for name in tasks.names()}
-    budgets = {name: config.budgets(name) for name in made}
+    made, budgets, faults = {}, {}, []
+    for name in tasks.names():
+        try:
+            made[name], budgets[name] = tasks.make(name), config.budgets(name)
+            if tasks.provider(name) != plugins.own():  # the contract tests check tsbench's own
+                check_promises(name, made[name])
+        except TsbenchError as error:
+            faults.append(str(error))
     rows = {
         name: {
             "version": task.version,
@@ -212,6 +240,7 @@ def _list(words: Sequence[str]) -> None:
             if (provider := kind.provider(name)) not in (None, plugins.own()):
                 brought.setdefault(str(provider), []).append(name)
     refused = tuple(dict.fromkeys((*tasks.refused(), *methods.refused())))
+    incomplete = (*config.incomplete(), *faults)
     offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for header in ("task", "version", "seconds", *offered):
@@ -228,10 +257,12 @@ def _list(words: Sequence[str]) -> None:
         table.add_row(name, summary)
     console.print(table)
     lines = [f"Plug-in {provider}: {', '.join(names)}" for provider, names in brought.items()]
-    for line in (*lines, *(f"Refused: {line}" for line in refused)):
+    lines += [f"Refused: {line}" for line in refused]
+    lines += [f"Incomplete: {line}" for line in incomplete]
+    for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     shown = {"tasks": rows, "methods": summaries, "plug-ins": brought, "refused": refused}
-    write_json(options.json, shown)
+    write_json(options.json, {**shown, "incomplete": incomplete})
 
 
 def _short(steps: int) -> str:
@@ -279,7 +310,7 @@ def _evaluate(words: Sequence[str]) -> int:
         help="v1, or smoke, which takes seconds (the protocol of the run's score, else v1)",
     )
     help_physics = (
-        "elliptic or half_step: also play the protocol there and count the changed verdicts"
+        "elliptic, half_step or warp: also play the protocol there and count changed verdicts"
     )
     parser.add_argument("--physics", metavar="NAME", help=help_physics)
     parser.add_argument("--threads", type=_threads, metavar="N", help="CPU threads (all)")
@@ -311,6 +342,7 @@ def _evaluate(words: Sequence[str]) -> int:
     log = run.actions(task) if kept else None
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
+    engine = _engine(options.physics)
     console, standard = Console(), tasks.standard(task)
     with progress_bar(console, "evaluate") as progress:
         score = evaluate(
@@ -335,6 +367,7 @@ def _evaluate(words: Sequence[str]) -> int:
                 protocol=protocol.elsewhere(options.physics),
                 threads=options.threads,
                 progress=progress,
+                engine=engine,
             )
         flipped = flips(score, other)
         console.print(tables.flips_table(options.physics, flipped))
@@ -347,6 +380,21 @@ def _evaluate(words: Sequence[str]) -> int:
         shown |= {"physics": {"score": other.as_dict(), "flips": [vars(one) for one in flipped]}}
     write_json(options.json, shown)
     return int(agrees is False)
+
+
+def _engine(physics: str | None) -> Any:
+    """What plays a score in one of the other physics (`evaluation.protocol.PHYSICS`).
+
+    Raises:
+        TsbenchError: its packages are not installed.
+    """
+    if physics == "warp":
+        from tsbench.sim.warp import HostPhysics
+
+        return HostPhysics
+    from tsbench.sim.physics import Physics
+
+    return Physics
 
 
 def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
@@ -378,7 +426,7 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
         if path.exists() or str(path) in references.POLICIES:
             raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
         raise TsbenchError(f"no run directory {path}")
-    task = tasks.make(name)
+    task = tasks.checked(name)
     return references.named(path, task) or foreign.load(path, task, trust_sb3), task
 
 
@@ -479,6 +527,42 @@ def _report(words: Sequence[str]) -> None:
     else:
         report.write_pages(run)
     sys.stdout.write(f"{path}\n")
+
+
+def _tune(words: Sequence[str]) -> None:
+    if "-h" in words or "--help" in words:
+        sys.stdout.write(TUNE_HELP)
+        return
+    try:
+        from tsbench.runs import tune
+    except ModuleNotFoundError as error:
+        if error.name != "optuna":
+            raise
+        raise TsbenchError("optuna is missing: pip install 'tsbench[tune]'") from None
+    from tsbench.core.files import write_json
+
+    parser = Parser("tsbench tune", add_help=False, allow_abbrev=False)
+    parser.add_argument("--best", action="store_true")
+    parser.add_argument("--json", type=_new_file)
+    options, others = parser.parse_known_args(words)
+    own = {"trials": "", "study": ""}
+    for key in own:
+        own[key] = next((w.partition("=")[2] for w in others if w.startswith(f"{key}=")), "")
+    common = [word for word in others if not word.startswith(tuple(f"{key}=" for key in own))]
+    study = tune.prepare(common, Path(own["study"]) if own["study"] else None)
+    if not options.best:
+        if not own["trials"]:
+            raise TsbenchError("trials=N is missing, the number of trials of the whole study")
+        try:
+            trials = _whole_number(own["trials"], 1, 10**6)
+        except argparse.ArgumentTypeError as error:
+            raise TsbenchError(f"trials {error}") from None
+        tune.tune(study, trials, told=lambda line: sys.stderr.write(f"{line}\n"))
+    trial, spent = tune.best(study)
+    chosen = study.chosen(trial.params)
+    sys.stdout.write(f"tsbench run {' '.join(chosen)}\n")
+    figures = {"words": chosen, "value": trial.value, "trial": trial.number, "trials": spent}
+    write_json(options.json, {**figures, "seeds": study.seeds})
 
 
 def _bench(words: Sequence[str]) -> None:
@@ -733,6 +817,7 @@ VERBS = {
     "evaluate": Verb("score a policy by a protocol", _evaluate),
     "view": Verb("show a run, a plan or a task in motion: live, as a page or as a video", _view),
     "report": Verb("write one page about a run: plan, motion, score and learning", _report),
+    "tune": Verb("search for good settings of a method, shared by processes", _tune),
     "export": Verb("write a policy of another library as tsbench's own file", _export),
     "submit": Verb("pack runs into an entry of the leaderboard", _submit),
     "verify": Verb("check whether entries of the leaderboard hold what they claim", _verify),

@@ -27,6 +27,25 @@ class Flame:
     length: float
 
 
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Straight lines that stay where they are.
+
+    Attributes:
+        name: of what they show.
+        note: says what that is.
+        colour: red, green, blue in [0, 1].
+        segments: both ends of each line in the world frame in metres, shape (m, 2, 3).
+        width: of a line, over the size of the picture.
+    """
+
+    name: str
+    note: str
+    colour: tuple[float, float, float]
+    segments: np.ndarray
+    width: float
+
+
 @dataclass(frozen=True)
 class Drawing:
     """Things to draw in pictures of a task in addition to its MuJoCo model.
@@ -40,6 +59,7 @@ class Drawing:
             flat world both corners have the same coordinate along the normal of its plane.
         worth: positions (n, 3) in metres -> reward of a robot at each position (n,); drawn within
             the bounds of a flat world.
+        lines: lines of the world.
     """
 
     feet: tuple[str, ...] = ()
@@ -47,3 +67,4 @@ class Drawing:
     flames: tuple[Flame, ...] = ()
     bounds: tuple[np.ndarray, np.ndarray] | None = None
     worth: Callable[[np.ndarray], np.ndarray] | None = None
+    lines: tuple[Lines, ...] = ()

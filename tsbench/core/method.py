@@ -54,6 +54,9 @@ class Problem:
         options: the method's options as in its config.
         seed: seed of all random numbers.
         threads: number of threads for the physics, or None for all cores.
+        device: that stages learn on: "cpu", "cuda", "cuda:N", or "warp" for a GPU's code on a CPU.
+        deterministic: whether a device other than the CPU has to give the same bits each time; the
+            CPU always does.
     """
 
     task: Task[Any]
@@ -62,6 +65,8 @@ class Problem:
     options: Mapping[str, Any]
     seed: int
     threads: int | None
+    device: str = "cpu"
+    deterministic: bool = False
 
 
 Snapshot = Mapping[str, Any]  # nested mappings of numpy arrays and JSON values

@@ -308,6 +308,43 @@ class ActionLog(_Recording):
 
 
 @dataclass(frozen=True)
+class Roadmap(_Recording):
+    """A roadmap as it is drawn. Positions are the robot's, in the world frame in metres.
+
+    Attributes:
+        nodes: shape (n, 3).
+        edges: pairs of indices of nodes, int64, shape (m, 2).
+        path: the way that was planned, shape (k, 3).
+        checked: edges that were checked, free or not.
+    """
+
+    kind: ClassVar[str] = "roadmap"
+    dimensions: ClassVar[dict[str, int]] = {"nodes": 2, "path": 2}
+
+    nodes: np.ndarray
+    edges: np.ndarray
+    path: np.ndarray
+    checked: int
+
+    def _problem(self) -> str | None:
+        if problem := super()._problem():
+            return problem
+        if type(self.checked) is not int or self.checked < 0:
+            return f"checked must be a number of edges, not {self.checked!r}"
+        if self.nodes.shape[1] != 3 or self.path.shape[1] != 3 or len(self.path) < 2:
+            return "nodes and path must be positions"
+        edges = self.edges
+        if not isinstance(edges, np.ndarray) or edges.dtype != np.int64 or edges.shape[1:] != (2,):
+            return "edges must be pairs of indices"
+        if edges.size and not 0 <= edges.min() <= edges.max() < len(self.nodes):
+            return "edges join nodes that are not there"
+        return None
+
+    def _content(self) -> dict[str, Any]:
+        return {**super()._content(), "edges": self.edges, "checked": self.checked}
+
+
+@dataclass(frozen=True)
 class AuditItem:
     """One measured property of a plan or reference motion, and its largest allowed value."""
 

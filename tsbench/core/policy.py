@@ -16,6 +16,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from tsbench.core.arrays import Array, array_namespace
 from tsbench.core.errors import TsbenchError, quoted, unknown
 from tsbench.core.files import read_file, read_json, write_whole
 from tsbench.core.typed import typed
@@ -44,18 +45,19 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def _plain(x: np.ndarray) -> np.ndarray:
+def _plain(x: Array) -> Array:
     return x
 
 
-def _symlog(x: np.ndarray) -> np.ndarray:
-    return np.sign(x) * np.log1p(np.abs(x))
+def _symlog(x: Array) -> Array:
+    xp = array_namespace(x)
+    return xp.sign(x) * xp.log1p(xp.abs(x))
 
 
 # Applied to observations before they are normalised. `symlog` (Hafner et al. 2023, DreamerV3)
 # compresses large values and keeps small ones apart. This helps where an observation ranges over
 # tens of metres but decimetres matter, such as a rocket's offset from its goal.
-ENCODINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"plain": _plain, "symlog": _symlog}
+ENCODINGS: dict[str, Callable[[Array], Array]] = {"plain": _plain, "symlog": _symlog}
 
 
 # Applied to what the last layer returns, before it is clipped to [-1, 1].
@@ -150,7 +152,11 @@ class Policy:
 
         Raises:
             OSError: a file cannot be written.
+            TsbenchError: an array is not of type float32, so `load` would refuse it.
         """
+        for array in (self.mean, self.scale, *self.weights, *self.biases):
+            if array.dtype != np.float32:
+                raise TsbenchError(f"the arrays of a policy are float32, not {array.dtype}")
         directory = Path(directory)
         content = self._content()
         info = asdict(self.info) | {"sha256": hashlib.sha256(content).hexdigest()}

@@ -27,7 +27,8 @@ import numpy as np
 from tsbench.core.arrays import Array, array_namespace, step_of
 from tsbench.core.drawing import Drawing
 from tsbench.core.errors import TsbenchError, unknown
-from tsbench.core.motion import Audit, Plan, ReferenceMotion
+from tsbench.core.motion import Audit, Plan, ReferenceMotion, Roadmap
+from tsbench.core.roadmap import Lattice, RoadmapSpace
 from tsbench.core.state import Course, Readings, Rng, S, Start
 
 Vector = tuple[float, float, float]
@@ -155,9 +156,10 @@ class Plant(ABC, Generic[S]):
         """The model, with goal and obstacles in it. The viewer frames and labels what is named
         `goal` (a site) and `obstacle_1`, `obstacle_2`, ... (spheres)."""
 
-    @abstractmethod
     def control(self, state: S, action: Array) -> tuple[Array, Array]:
-        """Actuator controls (..., nu) for an action, and the memory (..., m) for the next state."""
+        """Actuator controls (..., nu) for an action, and the memory (..., m) for the next state. By
+        default the controls are the clipped action, and the memory stays as it is."""
+        return array_namespace(action).clip(action, -1.0, 1.0), self.memory(state)
 
     @abstractmethod
     def read(self, readings: Readings) -> S:
@@ -312,6 +314,17 @@ class Abstraction(ABC, Generic[S]):
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
         """Full poses: abstract coordinates (k, len(coordinates)) -> qpos (k, nq)."""
 
+    # For planners that do not learn
+
+    def roadmap_space(self) -> RoadmapSpace[S] | None:
+        """The points that a roadmap joins; by default there are none."""
+        return None
+
+    def lattice(self) -> Lattice | None:
+        """The nodes of a cyclic motion that keeps the task's schedule; by default there are
+        none."""
+        return None
+
 
 class Tracker(ABC, Generic[S]):
     """The reward, ending and start of a task's imitation variant, given a reference motion.
@@ -377,6 +390,18 @@ class Plannable(Task[S]):
             raise unknown(f"imitation reward of {self.name}", form, self.imitation_forms)
         return form
 
+    def check_origin(self, made: Plan | ReferenceMotion | Roadmap) -> None:
+        """Checks that something was made for this task.
+
+        Raises:
+            TsbenchError: it was made for another task or version.
+        """
+        if (made.task, made.task_version) != (self.name, self.version):
+            raise TsbenchError(
+                f"the {made.kind} is for {made.task} version {made.task_version}, "
+                f"not for {self.name} version {self.version}"
+            )
+
     def check_fit(self, motion: Plan | ReferenceMotion) -> None:
         """Checks that a plan or reference motion belongs to this task.
 
@@ -384,11 +409,7 @@ class Plannable(Task[S]):
             TsbenchError: the motion is for another task or version, is far longer than an episode,
                 or its arrays have other sizes.
         """
-        if (motion.task, motion.task_version) != (self.name, self.version):
-            raise TsbenchError(
-                f"the {motion.kind} is for {motion.task} version {motion.task_version}, "
-                f"not for {self.name} version {self.version}"
-            )
+        self.check_origin(motion)
         frames = len(next(iter(motion.arrays.values())))
         longest = LONGEST_MOTION * self.horizon
         if frames > MOST_FRAMES * self.horizon or frames * motion.timestep > (
@@ -424,3 +445,15 @@ def plannable(task: MDP[S]) -> Plannable[S]:
     if not isinstance(task, Plannable):
         raise TsbenchError(f"{task.name} has no planning variant, which this needs")
     return task
+
+
+def roadmap_space(task: MDP[S], method: str) -> RoadmapSpace[S]:
+    """The points that a roadmap of the task joins.
+
+    Raises:
+        TsbenchError: the task has none, so that the method cannot do it.
+    """
+    space = task.abstraction().roadmap_space() if isinstance(task, Plannable) else None
+    if space is None:
+        raise TsbenchError(f"the method {method} cannot do {task.name}: it has no roadmap space")
+    return space

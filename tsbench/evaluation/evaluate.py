@@ -17,6 +17,7 @@ from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import V1, Condition, Protocol, perturbed_starts
 from tsbench.evaluation.robustness import robustness
 from tsbench.evaluation.score import Score, Summary
+from tsbench.sim.dynamics import Engine
 from tsbench.sim.episodes import Episodes, PolicyFunction, play
 from tsbench.sim.model import fingerprint
 from tsbench.sim.physics import Physics
@@ -29,6 +30,7 @@ def evaluate(
     protocol: Protocol = V1,
     threads: int | None = None,
     progress: Callable[[float], None] | None = None,
+    engine: Engine = Physics,
 ) -> Score:
     """Scores a policy.
 
@@ -38,6 +40,8 @@ def evaluate(
         protocol: the protocol of the score.
         threads: of the physics, None for all cores. Their number changes only the time taken.
         progress: called now and then with the share that is done, up to 1.
+        engine: the physics that plays everything. Only scores by `Physics` can be ranked; for
+            another engine the protocol must be of other physics (`Protocol.elsewhere`).
 
     Raises:
         TsbenchError: the policy was trained for another task, version or physics.
@@ -50,8 +54,8 @@ def evaluate(
     here = Condition(protocol.name, protocol.physics)
     starts = perturbed_starts(task, protocol)
     some = starts.rows(slice(0, protocol.changed))
-    nominal = _play(policy, task, task.start(np.random.default_rng(0), 1), here, threads)
-    perturbed = _play(policy, task, starts, here, threads)
+    nominal = _play(policy, task, task.start(np.random.default_rng(0), 1), here, threads, engine)
+    perturbed = _play(policy, task, starts, here, threads, engine)
     summary = _summary(task, perturbed)
     return Score(
         protocol=protocol.name,
@@ -63,11 +67,12 @@ def evaluate(
         nominal=_summary(task, nominal),
         changes={
             condition.name: _summary(
-                task, _play(policy, task, some, condition.on(protocol.physics), threads)
+                task,
+                _play(policy, task, some, condition.on(protocol.physics), threads, engine),
             )
             for condition in protocol.conditions
         },
-        robustness=robustness(policy, task, protocol, threads),
+        robustness=robustness(policy, task, protocol, threads, engine),
         origin=origin,
         log=ActionLog(
             task=task.name,
@@ -85,7 +90,7 @@ def solved_rewards(
     """The normalized reward of each perturbed episode, zero where it was not solved, shape (n,).
     `Score.solved_reward` is their mean."""
     here = Condition(protocol.name, protocol.physics)
-    episodes = _play(policy, task, perturbed_starts(task, protocol), here, threads)
+    episodes = _play(policy, task, perturbed_starts(task, protocol), here, threads, Physics)
     rewards: np.ndarray = episodes.normalized * task.success(episodes.final, episodes.course)
     return rewards
 
@@ -143,10 +148,11 @@ def _play(
     task: Task[Any],
     starts: Start,
     condition: Condition,
-    threads: int | None = None,
+    threads: int | None,
+    engine: Engine,
 ) -> Episodes[Any]:
     count = len(starts.time)
-    physics: Physics[Any] = Physics(task, count, threads=threads, change=condition.change)
+    physics = engine(task, count, threads=threads, change=condition.change)
     begin = physics.place(np.arange(count), starts)
     delay = condition.delay
     return play(task, physics, policy, count, begin=begin, delay=delay, measure=task.measured)

@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_info
 
 from tsbench import tasks
+from tsbench.core import plugins
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task
 from tsbench.evaluation.foreign import ForeignPolicy
@@ -20,7 +21,7 @@ from tsbench.evaluation.protocol import Protocol
 from tsbench.sim.episodes import PolicyFunction
 from tsbench.sim.model import compiled_hash, fingerprint
 
-PACKAGES = ("mujoco", "numpy", "scipy", "tsbench")
+PACKAGES = ("mujoco", "numpy", "scipy")
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class Origin:
             policy=policy.sha256 if isinstance(policy, (Policy, ForeignPolicy)) else None,
             packages={"python": platform.python_version()}
             | {name: version(name) for name in PACKAGES}
+            | {plugins.OWN: plugins.own().version}
             | plugin,
             machine=machine(),
         )

@@ -106,10 +106,12 @@ class Protocol:
         return replace(self, name=name, ranked=False, physics=PHYSICS[physics])
 
 
-# Other ways to compute the same world, by name.
+# Other ways to compute the same world, by name. "warp" changes nothing in the model: it is another
+# engine, which `evaluate` has to be given (`sim.warp.HostPhysics`).
 PHYSICS = {
     "elliptic": Change(cone="elliptic", impratio=10.0),
     "half_step": Change(refine=2),
+    "warp": Change(),
 }
 CONDITIONS = (
     Condition("mass x 0.8", Change(mass=0.8)),

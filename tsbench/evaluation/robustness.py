@@ -12,14 +12,10 @@ from scipy.optimize import isotonic_regression
 from tsbench.core.state import Course, Start
 from tsbench.core.task import Task
 from tsbench.evaluation.protocol import REFERENCE_MASS, Protocol
-from tsbench.sim.change import Change
+from tsbench.sim.dynamics import Engine, PlacedDynamics
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push, direction
-
-# Pushes that are played side by side. A rocket takes 15 MB of address space, and larger blocks are
-# no faster.
-_BLOCK = 128
 
 
 @dataclass(frozen=True)
@@ -93,13 +89,17 @@ class Outcome:
 
 
 def robustness(
-    policy: PolicyFunction, task: Task[Any], protocol: Protocol, threads: int | None = None
+    policy: PolicyFunction,
+    task: Task[Any],
+    protocol: Protocol,
+    threads: int | None = None,
+    engine: Engine = Physics,
 ) -> Robustness:
     """Plays every push of the protocol."""
     scale = mass_scale(task)
     forces = np.array(protocol.forces, float) * scale
     phases = task.push_steps[:: protocol.phases]
-    outcome = pushed(policy, task, forces, phases, protocol, threads)
+    outcome = pushed(policy, task, forces, phases, protocol, threads, engine)
     claim, impulses = protocol.forces.index(protocol.claim), forces * protocol.duration
     (survival, survival_bound), (recovery, recovery_bound) = (
         impulse_50(impulses, held.mean(axis=(1, 2)), calm)
@@ -142,6 +142,7 @@ def pushed(
     phases: tuple[int, ...],
     protocol: Protocol,
     threads: int | None = None,
+    engine: Engine = Physics,
 ) -> Outcome:
     """The outcome of every push.
 
@@ -152,8 +153,10 @@ def pushed(
         phases: control steps at which the pushes begin.
         protocol: gives headings, duration and physics.
         threads: threads of the physics, None for all cores.
+        engine: the physics that plays everything.
     """
-    moments = _moments(policy, task, phases, protocol.physics, threads)
+    calm = engine(task, 1, threads=threads, change=protocol.physics)
+    moments = _moments(policy, task, phases, calm)
     headings = protocol.directions()
     shape = (len(forces), len(headings), len(phases))
     survived, recovered = np.zeros(shape, bool), np.zeros(shape, bool)
@@ -169,11 +172,10 @@ def pushed(
         force=forces[force, None] * direction(task, headings[heading]),
     )
     # All blocks share one physics, because freed memory does not always return to the system.
-    physics: Physics[Any] = Physics(
-        task, min(_BLOCK, len(phase)), threads=threads, change=protocol.physics
-    )
-    for first in range(0, len(phase), _BLOCK):
-        block = slice(first, first + _BLOCK)
+    size = min(calm.side_by_side, len(phase))
+    physics = engine(task, size, threads=threads, change=protocol.physics)
+    for first in range(0, len(phase), size):
+        block = slice(first, first + size)
         rows = np.arange(len(phase[block]))
         physics.push = pushes.rows(block)
         begin, course = physics.place(rows, starts.rows(block)), courses.rows(block)
@@ -205,16 +207,15 @@ def _moments(
     policy: PolicyFunction,
     task: Task[Any],
     phases: tuple[int, ...],
-    change: Change,
-    threads: int | None,
+    physics: PlacedDynamics[Any],
 ) -> _Moments:
-    physics: Physics[Any] = Physics(task, 1, threads=threads, change=change)
-    qpos, qvel = physics.batch.bind("qpos"), physics.batch.bind("qvel")
+    """The episode that `physics`, of one simulation, plays."""
     states: list[Any] = []
 
     def record(state: Any) -> np.ndarray:
         states.append(state)
-        return np.concatenate([state.time[:, None], qpos, qvel, task.memory(state)], axis=-1)
+        place = [state.time[:, None], *physics.pose(), task.memory(state)]
+        return np.concatenate(place, axis=-1)
 
     episode = play(task, physics, policy, 1, record=record)
     assert episode.states is not None
@@ -222,7 +223,7 @@ def _moments(
     for previous, state in itertools.pairwise(states):
         courses.append(task.followed(courses[-1], previous, state))
     at = np.array(phases)
-    ends = np.cumsum([1, qpos.shape[1], qvel.shape[1]])
+    ends = np.cumsum([1, *(part.shape[1] for part in physics.pose())])
     time, positions, velocities, memory = np.split(episode.states[at, 0], ends, axis=-1)
     survived = bool(episode.survived[0])
     return _Moments(

@@ -7,7 +7,7 @@ An entry is a directory `v1/TASK/ENTRY/` of a board (`leaderboards/` in the repo
         policy.json, policy.safetensors      the policy
         score.json, actions.npz              its score, and actions to replay the physics from
         config.yaml, versions.json           how it was trained, if tsbench trained it
-        plan.npz, reference.npz              what was planned, if its method plans
+        plan.npz, reference.npz, roadmap.npz     what was planned, if its method plans
 
 The manifest is written in one way only (`Manifest.encode`) and holds a hash of itself, so that a
 change of any byte of an entry is noticed. That is no signature: whoever changes a file can write
@@ -57,6 +57,7 @@ OPTIONAL = {
     "versions.json": directory.MAX_VERSIONS,
     "plan.npz": motion.MAX_FILE,
     "reference.npz": motion.MAX_FILE,
+    "roadmap.npz": motion.MAX_FILE,
 }
 LIMITS = {**NEEDED, **OPTIONAL}
 MAX_MANIFEST = 512 * 2**10  # bytes
@@ -486,8 +487,9 @@ def cost_of(record: Record) -> tuple[int, int, float]:
 def _remarks(run: RunDirectory, task: Task[Any]) -> Iterator[str]:
     """
     Raises:
-        TsbenchError: plan or reference motion is damaged or does not fit the task.
+        TsbenchError: plan, reference motion or roadmap is damaged or does not fit the task.
     """
+    run.roadmap(task)
     plan, reference = run.plan(task), run.reference(task)
     if plan is None or reference is None:
         return

@@ -248,8 +248,8 @@ def _hidden(kept: Kept, asked: Asked, findings: _Findings) -> tuple[bool, str]:
     error = float(np.sqrt((known.var(ddof=1) + unknown.var(ddof=1)) / len(known)))
     allowed = HIDDEN_ERRORS * error
     words = (
-        f"claims a solved_reward of {claimed:.4g} and earns {found:.4g} from hidden starts "
-        f"({claimed - found:+.2g} less, where chance allows {allowed:.2g})"
+        f"claims a solved_reward of {claimed:.4g} and earns {found:.4g} from hidden starts; "
+        f"it may earn {allowed:.2g} less by chance"
     )
     return claimed - found <= allowed, words
 

@@ -1,1 +1,1 @@
-"""Geometry of plans: gaits, paths, and inverse kinematics from abstract states to poses."""
+"""Planning without learning: gaits, paths, roadmaps, and inverse kinematics to poses."""

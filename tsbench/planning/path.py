@@ -11,6 +11,17 @@ from tsbench.core.arrays import Array, array_namespace, like
 _BEFORE_AND_AFTER = np.array([-1, 0])  # the segments at a vertex
 
 
+def segment_distance(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distance of a point (d,) from each straight segment between `first` and `second`, each of
+    shape (n, d); shape (n,)."""
+    along = second - first
+    squared = np.maximum(np.sum(along * along, axis=-1), 1e-300)
+    share = np.clip(np.sum((point - first) * along, axis=-1) / squared, 0.0, 1.0)
+    nearest = first + share[:, None] * along
+    distance: np.ndarray = np.linalg.norm(point - nearest, axis=-1)
+    return distance
+
+
 @dataclass(frozen=True)
 class Path:
     """A polyline with many short segments of similar length.

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -21,12 +20,14 @@ from rsl_rl.storage import RolloutStorage
 from tsbench.core.errors import NotFiniteError, TsbenchError
 from tsbench.core.policy import Policy, PolicyInfo
 from tsbench.core.task import Task
+from tsbench.rl import processes
 from tsbench.rl.rollout import Rollout
 from tsbench.rl.settings import PPOSettings
 from tsbench.rl.threads import one_thread
 from tsbench.rl.update import make_update
-from tsbench.rl.vec_env import TorchEnvironment
+from tsbench.rl.vec_env import learner_environment
 from tsbench.sim.batched import BatchedEnvironment
+from tsbench.sim.device import DeviceEnvironment
 from tsbench.sim.model import fingerprint
 
 Prepare = Callable[[int], None]  # (environment steps so far)
@@ -37,13 +38,13 @@ class Learner:
     """An actor and a critic that learn in one environment.
 
     Attributes:
-        steps: environment steps taken.
+        steps: environment steps taken, of all processes together.
     """
 
     @one_thread()
     def __init__(
         self,
-        environment: BatchedEnvironment[Any],
+        environment: BatchedEnvironment[Any] | DeviceEnvironment[Any],
         settings: PPOSettings,
         seed: int,
         actor_from: Learner | None = None,
@@ -53,12 +54,8 @@ class Learner:
         torch.manual_seed(seed)
         self.settings = settings
         self.environment = environment
-        self._env = TorchEnvironment(environment, settings.encoding, settings.repeat)
+        self._env = learner_environment(environment, settings.encoding, settings.repeat)
         self.steps = 0
-        self._returns: deque[float] = deque(maxlen=100)
-        self._lengths: deque[int] = deque(maxlen=100)
-        self._return = np.zeros(environment.count)
-        self._length = np.zeros(environment.count, int)
         self._actor, self._critic = self._networks()
         storage = RolloutStorage(
             "rl",
@@ -84,6 +81,8 @@ class Learner:
                 self._critic.obs_normalizer.load_state_dict(seen.state_dict())
             with torch.no_grad():
                 self._actor.distribution.log_std_param.fill_(math.log(settings.initial_std))
+        if processes.count() > 1:  # the same weights, but other actions
+            torch.manual_seed(processes.own(seed))
 
     def _networks(self) -> tuple[MLPModel, MLPModel]:
         """Actor and critic with initial weights."""
@@ -131,37 +130,37 @@ class Learner:
             if prepare is not None:
                 prepare(self.steps)
             started = time.perf_counter()
-            before = (self.environment.seconds, self.environment.dynamics.seconds)
+            before = env.seconds
             with torch.inference_mode():
                 for _ in range(self.settings.rollout):
                     actions = rollout.act(observation)
                     observation, rewards, dones, extras = env.step(actions)
-                    self._count(rewards, dones, extras)
+                    env.count(rewards, dones, extras)
                     rewards += self._credit(extras)
                     if not self.settings.bootstrap:
                         del extras["time_outs"]
                     rollout.add(rewards, dones, extras)
                 rollout.finish(observation)
             std = self._actor.output_std.mean().item()
+            env.check()
             collected = time.perf_counter()
             losses = self._update.update()
             self._expect_finite(losses)
             self._expect_sound()
-            self.steps += self.settings.steps
+            self.steps += self.settings.steps * processes.count()
             self._settle(min(self.steps / steps, 1.0))
             if report is not None:
+                environment, physics = env.seconds
                 metrics = {
                     "collect_seconds": collected - started,
-                    "environment_seconds": self.environment.seconds - before[0],
-                    "physics_seconds": self.environment.dynamics.seconds - before[1],
+                    "environment_seconds": environment - before[0],
+                    "physics_seconds": physics - before[1],
                     "update_seconds": time.perf_counter() - collected,
                     "value_loss": losses["value"],
                     "learning_rate": self._update.learning_rate,
                     "std": std,
+                    **env.finished(),
                 }
-                if self._returns:
-                    metrics["episode_return"] = float(np.mean(self._returns))
-                    metrics["episode_length"] = float(np.mean(self._lengths))
                 report(self.steps, metrics)
 
     def _expect_finite(self, losses: Mapping[str, float]) -> None:
@@ -207,20 +206,6 @@ class Learner:
         spared, quality = extras["spared"] / s.repeat, extras["quality"]
         return self.environment.mdp.credit(spared, quality, s.discount**s.repeat)
 
-    def _count(
-        self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, torch.Tensor]
-    ) -> None:
-        repeat = self.settings.repeat  # an episode's last hold counts in full
-        self._return += rewards.numpy() * repeat
-        credit = self.environment.mdp.credit(extras["spared"], extras["quality"])
-        self._return += credit.numpy()
-        self._length += repeat
-        ended = np.flatnonzero(dones.numpy())
-        self._returns.extend(self._return[ended].tolist())
-        self._lengths.extend(self._length[ended].tolist())
-        self._return[ended] = 0.0
-        self._length[ended] = 0
-
     def snapshot(self) -> dict[str, Any]:
         """Everything that the next iteration depends on: plain values, and arrays that the
         iteration will overwrite."""
@@ -229,14 +214,8 @@ class Learner:
             "actor": _arrays(self._actor.state_dict()),
             "critic": _arrays(self._critic.state_dict()),
             "update": self._update.snapshot(),
-            "rng": torch.get_rng_state().numpy(),
+            "rng": random_state(self._env.device),
             "environment": self._env.snapshot(),
-            "episodes": {
-                "returns": list(self._returns),
-                "lengths": list(self._lengths),
-                "return": self._return,
-                "length": self._length,
-            },
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -250,13 +229,8 @@ class Learner:
             self._actor.load_state_dict(_tensors(snapshot["actor"]))
             self._critic.load_state_dict(_tensors(snapshot["critic"]))
             self._update.restore(snapshot["update"])
-            torch.set_rng_state(torch.from_numpy(snapshot["rng"]))
+            set_random_state(self._env.device, snapshot["rng"])
             self._env.restore(snapshot["environment"])
-            episodes = snapshot["episodes"]
-            self._returns.extend(episodes["returns"])
-            self._lengths.extend(episodes["lengths"])
-            self._return[:] = episodes["return"]
-            self._length[:] = episodes["length"]
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             reason = " ".join(str(error).split())
             raise TsbenchError(f"the checkpoint does not fit this stage: {reason}") from None
@@ -281,6 +255,21 @@ class Learner:
             weights=weights,
             biases=tuple(layer.bias.numpy(force=True).copy() for layer in linear),
         )
+
+
+def random_state(device: str) -> dict[str, np.ndarray]:
+    """The states of torch's generators of the CPU and of the device, by kind."""
+    states = {"cpu": torch.get_rng_state().numpy()}
+    if torch.device(device).type == "cuda":
+        states["cuda"] = torch.cuda.get_rng_state(device).numpy()
+    return states
+
+
+def set_random_state(device: str, states: Mapping[str, np.ndarray]) -> None:
+    """Restores the states of torch's generators."""
+    torch.set_rng_state(torch.from_numpy(states["cpu"]))
+    if torch.device(device).type == "cuda":
+        torch.cuda.set_rng_state(torch.from_numpy(states["cuda"]), device)
 
 
 def _arrays(tensors: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:

@@ -1,9 +1,13 @@
-"""The stages that methods are made of: PPO on a task, on its imitation, on its planning variant."""
+"""The stages that methods are made of: PPO on a task, on its imitation, on its planning variant.
+
+They learn on the problem's device, of which methods need not know.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from typing import Any
 
 from tsbench.core.errors import PlanError, TsbenchError
@@ -11,13 +15,18 @@ from tsbench.core.method import AUDITS, Monitor, Problem, Workspace
 from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.core.task import SimulatedTask, plannable
 from tsbench.core.typed import typed_items
+from tsbench.rl import processes
+from tsbench.rl.devices import CPU, torch_device, working_on
 from tsbench.rl.ppo import Learner, Report
 from tsbench.rl.settings import PPOSettings
 from tsbench.sim.batched import BatchedEnvironment
+from tsbench.sim.device import DeviceDynamics, DeviceEnvironment, DeviceKinematics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.physics import Physics
 from tsbench.sim.tracking import Imitation
+
+Environment = BatchedEnvironment[Any] | DeviceEnvironment[Any]
 
 
 @dataclass(frozen=True)
@@ -33,7 +42,8 @@ def settings(problem: Problem, kind: str) -> StageSettings:
     """The settings of a kind of stage.
 
     Kinds are the names that methods give in their `STAGES`. Two have rules of their own: `plan` has
-    no physics that could be disturbed, and `finetune` begins with the settings of `imitate`.
+    no physics that could be disturbed, and `finetune` begins with the settings of `imitate`. Off
+    the CPU and in several processes `update: auto` is rsl-rl's own update.
 
     Raises:
         TsbenchError: unknown names or values of the wrong type or range.
@@ -47,6 +57,13 @@ def settings(problem: Problem, kind: str) -> StageSettings:
     if disturb != Disturbances() and disturb.interval < problem.task.timestep:
         step = f"a control step of {problem.task.timestep:.3g} s"
         raise TsbenchError(f"task.training.{kind}.disturb.interval must be at least {step}")
+    if problem.device != CPU or processes.count() > 1:
+        if changes.get("update") == "numpy":
+            where = f"on {problem.device}" if problem.device != CPU else "in several processes"
+            raise TsbenchError(
+                f"task.training.{kind}.update: numpy works in one process on the CPU, not {where}"
+            )
+        changes["update"] = "rsl_rl"
     try:
         return StageSettings(**changes)
     except ValueError as error:
@@ -82,14 +99,16 @@ def learn_planning(
     """
     chosen = settings(problem, "plan")
     planning: Planning[Any] = Planning(problem.task, explore=explore)
-    environment = BatchedEnvironment(planning, planning, chosen.environments, problem.seed)
 
     def prepare(taken: int) -> None:
         planning.explore = explore if taken < steps // 2 else 0.0
 
-    with workspace.stage("plan", steps) as monitor:
-        learner = Learner(environment, chosen, problem.seed)
-        learner.learn(steps, _reporting(learner, monitor), prepare)
+    device = torch_device(problem.device)
+    with working_on(device, deterministic=problem.deterministic):
+        environment = planning_environment(problem, planning, chosen.environments)
+        with workspace.stage("plan", steps) as monitor:
+            learner = Learner(environment, chosen, problem.seed)
+            learner.learn(steps, _reporting(learner, monitor), prepare)
     return learner
 
 
@@ -105,14 +124,47 @@ def learn_physics(
     """PPO on a task in full physics, or on its imitation variant, under the disturbances that the
     stage's settings ask for."""
     chosen = settings(problem, kind)
-    physics: Physics[Any] = DisturbedPhysics(
-        task, chosen.environments, chosen.disturb, problem.seed, threads=problem.threads
-    )
-    environment = BatchedEnvironment(task, physics, chosen.environments, problem.seed)
-    with workspace.stage(name, steps) as monitor:
-        learner = Learner(environment, chosen, problem.seed, start_from)
-        learner.learn(steps, _reporting(learner, monitor, physics))
+    device = torch_device(problem.device)
+    with working_on(device, deterministic=problem.deterministic):
+        environment = physics_environment(problem, task, chosen)
+        with workspace.stage(name, steps) as monitor:
+            learner = Learner(environment, chosen, problem.seed, start_from)
+            physics: Any = environment.dynamics
+            learner.learn(steps, _reporting(learner, monitor, physics))
     return learner
+
+
+def planning_environment(problem: Problem, planning: Planning[Any], count: int) -> Environment:
+    """`count` episodes of the planning variant on the problem's device."""
+    seed = processes.own(problem.seed)
+    if problem.device == CPU:
+        return BatchedEnvironment(planning, planning, count, seed)
+    device = torch_device(problem.device)
+    dynamics = DeviceKinematics(planning, count, seed, device)
+    return DeviceEnvironment(planning, dynamics, count, seed, device)
+
+
+def physics_environment(
+    problem: Problem, task: SimulatedTask[Any], chosen: StageSettings
+) -> Environment:
+    """Episodes of a task in full physics on the problem's device, disturbed as `chosen` says."""
+    count, disturb, seed = chosen.environments, chosen.disturb, processes.own(problem.seed)
+    if problem.device == CPU:
+        physics: Physics[Any] = DisturbedPhysics(
+            task, count, disturb, seed, threads=problem.threads
+        )
+        return BatchedEnvironment(task, physics, count, seed)
+    device = torch_device(problem.device)
+    dynamics: DeviceDynamics[Any] = import_module("tsbench.sim.warp").WarpPhysics(  # of an extra
+        task,
+        count,
+        device=device,
+        disturbances=disturb,
+        seed=seed,
+        threads=problem.threads,
+        deterministic=problem.deterministic,
+    )
+    return DeviceEnvironment(task, dynamics, count, seed, device)
 
 
 @dataclass(frozen=True)
@@ -178,7 +230,11 @@ def _audit(
         )
 
 
-def _reporting(learner: Learner, monitor: Monitor, physics: Physics[Any] | None = None) -> Report:
+def _reporting(
+    learner: Learner,
+    monitor: Monitor,
+    physics: Physics[Any] | DeviceDynamics[Any] | None = None,
+) -> Report:
     """Restores the learner of an interrupted run, if there is one, and returns the function that
     reports iterations."""
     if monitor.saved is not None:

@@ -20,6 +20,7 @@ from rsl_rl.storage import RolloutStorage
 from torch import nn
 
 from tsbench.core.errors import TsbenchError
+from tsbench.rl import processes
 from tsbench.rl.settings import PPOSettings
 
 WIDE = 512  # hidden layer size from which numpy saves less than a third (docs/speed.md)
@@ -74,7 +75,7 @@ def make_update(
 
 
 class RslUpdate:
-    """rsl-rl's own update, on any device. An `Update`."""
+    """rsl-rl's own update, on any device, and of several processes together. An `Update`."""
 
     def __init__(
         self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, settings: PPOSettings
@@ -96,6 +97,7 @@ class RslUpdate:
             desired_kl=settings.desired_kl,
             normalize_advantage_per_mini_batch=settings.minibatch_advantages,
             device=str(storage.device),
+            multi_gpu_cfg=_processes(),
         )
 
     @property
@@ -109,7 +111,11 @@ class RslUpdate:
             group["lr"] = rate
 
     def update(self) -> dict[str, float]:
-        return self._ppo.update()
+        losses = self._ppo.update()
+        if self._ppo.is_multi_gpu:
+            # rsl-rl averages gradients only: this keeps the normalisers of observations alike too.
+            self._ppo.broadcast_parameters()
+        return losses
 
     def snapshot(self) -> dict[str, Any]:
         state = self._ppo.optimizer.state_dict()["state"]
@@ -135,6 +141,17 @@ class RslUpdate:
         }
         optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
         self.learning_rate = snapshot["learning_rate"]
+
+
+def _processes() -> dict[str, int] | None:
+    """What rsl-rl is told of the processes that learn together."""
+    if processes.count() == 1:
+        return None
+    return {
+        "global_rank": processes.rank(),
+        "local_rank": processes.local_rank(),
+        "world_size": processes.count(),
+    }
 
 
 def _elu(x: Array, out: Array) -> None:

@@ -7,9 +7,11 @@ the result its types and turns every mistake in it into an error of one line.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from importlib import import_module
 from importlib.resources.abc import Traversable
 from typing import Any
 
@@ -38,7 +40,25 @@ from tsbench.core.typed import typed, unknown_key
 SEEDS = 2**32  # numpy and torch both take 32 bits
 CONFIGURATIONS = "tsbench.conf"
 VERSION_BASE = "1.3"  # the defaults of this Hydra release
-OPEN_MAPPINGS = ("task.training.", "task.constants.")
+OPEN_MAPPINGS = ("task.training.", "task.constants.", "task.gpu.")
+DEVICES = "cpu, cuda, cuda:N, auto, warp"
+DEVICE = re.compile(r"cpu|cuda(:\d{1,3})?|auto|warp")
+
+
+@dataclass(frozen=True)
+class OnGPU:
+    """What a GPU changes of a task's configuration, since it steps many more environments at once.
+
+    A run's configuration has the changes in it, except where words on the command line say
+    otherwise.
+
+    Attributes:
+        budgets: some keys of some budgets, by name.
+        training: some PPO settings by kind of stage.
+    """
+
+    budgets: dict[str, dict[str, Any]] = field(default_factory=dict)
+    training: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -50,12 +70,14 @@ class TaskConfig:
         budgets: the task's budgets, by name.
         training: changes to the PPO settings by kind of stage (a method's `STAGES`).
         constants: changed constants of the task, for studies; such a score cannot be ranked.
+        gpu: what a GPU changes of budgets and training.
     """
 
     name: str
     budgets: dict[str, Budget]
     training: dict[str, dict[str, Any]] = field(default_factory=dict)
     constants: dict[str, Any] = field(default_factory=dict)
+    gpu: OnGPU = field(default_factory=OnGPU)
 
 
 @dataclass(frozen=True)
@@ -70,6 +92,8 @@ class RunConfig:
         directory: the run directory, or None for the standard place.
         threads: CPU threads, or None for all.
         checkpoint: seconds of training between checkpoints.
+        device: "cpu", "cuda", "cuda:N", "warp" (a GPU's code on a CPU, for tests), or "auto".
+        deterministic: whether a device other than the CPU has to give the same bits each time.
 
     Raises:
         TsbenchError: a value is missing, unknown or out of range.
@@ -82,6 +106,8 @@ class RunConfig:
     directory: str | None = None
     threads: int | None = None
     checkpoint: float = 30.0
+    device: str = "cpu"
+    deterministic: bool = False
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -98,6 +124,10 @@ class RunConfig:
             raise TsbenchError(f"threads must be at least 1, not {self.threads}")
         if not self.checkpoint >= 0.0:
             raise TsbenchError(f"checkpoint must not be negative, not {self.checkpoint}")
+        if not DEVICE.fullmatch(self.device):
+            raise TsbenchError(f"device must be one of {DEVICES}, not {self.device!r}")
+        if self.deterministic and self.device == "cpu":
+            raise TsbenchError("deterministic: true is for a GPU; on the CPU every run is")
         if self.budget not in self.task.budgets:
             raise unknown("budget", self.budget, self.task.budgets)
 
@@ -138,11 +168,24 @@ def compose(words: Sequence[str]) -> RunConfig:
             node = hydra_compose("config", overrides=opened(words))
     except ValueError as error:  # Hydra raises it where the value of a group is not a name
         raise TsbenchError(f"{_flat(error)} (in: {' '.join(words)})") from None
-    return parse(node)
+    config = parse(node, keys(words))
+    files = {override.key_or_group: override.value() for override in overrides}
+    for group, name in (("task", config.task.name), ("method", config.method["name"])):
+        _check_name(group, files.get(group, name), name)
+    return config
 
 
-def parse(node: DictConfig) -> RunConfig:
-    """Gives a composed configuration its types.
+def _check_name(group: str, file: str, name: str) -> None:
+    if name != file:
+        raise TsbenchError(f"conf/{group}/{file}.yaml must have name: {file}, not {name}")
+
+
+def parse(node: DictConfig, given: Collection[str]) -> RunConfig:
+    """Gives a composed configuration its types, and on a GPU makes the changes of `task.gpu`.
+
+    Args:
+        node: as Hydra has composed it.
+        given: the keys that words set, which a GPU does not change.
 
     Raises:
         TsbenchError: a key is missing or unknown, or a value is of the wrong type or range.
@@ -150,7 +193,25 @@ def parse(node: DictConfig) -> RunConfig:
     with one_line_errors():
         plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     config: RunConfig = typed(RunConfig, plain, "")
-    return config
+    if config.device == "auto":
+        # Only here, because torch takes a second to load.
+        config = replace(config, device=import_module("tsbench.rl.devices").pick())
+    if not config.device.startswith("cuda"):
+        return config
+    changed = asdict(config)
+    for group, names in vars(config.task.gpu).items():
+        for name, changes in names.items():
+            for key, value in changes.items():
+                path = f"task.{group}.{name}.{key}"
+                if not any(path == word or path.startswith(f"{word}.") for word in given):
+                    changed["task"][group].setdefault(name, {})[key] = value
+    adapted: RunConfig = typed(RunConfig, changed, "")
+    return adapted
+
+
+def keys(words: Sequence[str]) -> set[str]:
+    """The keys that `key=value` words set, other than the choices of task and method."""
+    return {override.key_or_group for override in parse_words(words)} - {"task", "method"}
 
 
 def sweep(words: Sequence[str]) -> Iterator[list[str]]:
@@ -195,6 +256,21 @@ def names(group: str) -> tuple[str, ...]:
     return tuple(sorted(_files(group)))
 
 
+def incomplete() -> tuple[str, ...]:
+    """A line for each task and method that can be made but not run, since it has no configuration
+    of its name."""
+    return tuple(
+        _lacking(group, name)
+        for group, registry in (("task", tasks), ("method", methods))
+        for name in registry.names()
+        if name not in _files(group)
+    )
+
+
+def _lacking(group: str, name: str) -> str:
+    return f"the {group} {name!r} cannot be run: its package lacks conf/{group}/{name}.yaml"
+
+
 def budgets(task: str) -> dict[str, Budget]:
     """The budgets that a task's configuration offers; none without a configuration.
 
@@ -207,6 +283,7 @@ def budgets(task: str) -> dict[str, Budget]:
     with one_line_errors():
         plain = OmegaConf.to_container(OmegaConf.create(file.read_text("utf-8")), resolve=True)
     config: TaskConfig = typed(TaskConfig, plain, "task")
+    _check_name("task", task, config.name)
     return config.budgets
 
 
@@ -235,9 +312,7 @@ def one_line_errors() -> Iterator[None]:
         parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
         registry = {"task": tasks, "method": methods}.get(parts[0])
         if registry is not None and parts[2] in registry.names():
-            raise TsbenchError(
-                f"the {parts[0]} {parts[2]!r} cannot be run: its package lacks conf/{missing}.yaml"
-            ) from None
+            raise TsbenchError(_lacking(parts[0], parts[2])) from None
         raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__

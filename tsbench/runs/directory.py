@@ -17,7 +17,7 @@ from tsbench.core.files import (
     read_file,
     read_json,
 )
-from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
+from tsbench.core.motion import ActionLog, Plan, ReferenceMotion, Roadmap
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
@@ -133,6 +133,7 @@ class RunDirectory:
     dump_file = _File("not-finite.npz")
     plan_file = _File("plan.npz")
     reference_file = _File("reference.npz")
+    roadmap_file = _File("roadmap.npz")
     policy_info_file = _File("policy.json")
     policy_file = _File("policy.safetensors")
     actions_file = _File("actions.npz")
@@ -224,6 +225,21 @@ class RunDirectory:
             TsbenchError: the file is damaged, or the motion does not fit the task.
         """
         return _motion(ReferenceMotion, self.reference_file, task)
+
+    def roadmap(self, task: Task[Any]) -> Roadmap | None:
+        """The roadmap that the run planned with, or None if it used none.
+
+        Raises:
+            TsbenchError: the file is damaged, or the roadmap is another task's.
+        """
+        if not _there(self.roadmap_file):
+            return None
+        roadmap = Roadmap.load(self.roadmap_file)
+        try:
+            plannable(task).check_origin(roadmap)
+        except TsbenchError as error:
+            raise TsbenchError(f"{self.roadmap_file}: {error}") from None
+        return roadmap
 
     def actions(self, task: Task[Any]) -> ActionLog | None:
         """The run's action log, or None if it has none.

@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -29,10 +30,13 @@ from tsbench.core.errors import (
 )
 from tsbench.core.files import leftovers, taken, write_json, write_whole
 from tsbench.core.method import Problem
+from tsbench.core.policy import Policy
 from tsbench.core.typed import unknown_key
-from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
+from tsbench.rl import processes
+from tsbench.rl.devices import torch_device
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
 from tsbench.runs.config import RunConfig
@@ -49,13 +53,16 @@ def prepare(config: RunConfig) -> Problem:
         TsbenchError: unknown names, or values of the wrong type.
     """
     problem = Problem(
-        task=tasks.make(config.task.name, **config.task.constants),
+        task=tasks.checked(config.task.name, **config.task.constants),
         budget=config.task.budgets[config.budget],
         training=config.task.training,
         options=config.method,
         seed=config.seed,
         threads=config.threads,
+        device=config.device,
+        deterministic=config.deterministic,
     )
+    torch_device(problem.device)
     name = config.method["name"]
     methods.options(methods.find(name).Options, problem)
     known = methods.all_stages()
@@ -95,6 +102,21 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
             raise
 
 
+def assist(config: RunConfig) -> None:
+    """Trains with the first of several processes, which executes the run. Leaves no files.
+
+    Raises:
+        TsbenchError: as `execute`.
+    """
+    problem = prepare(config)
+    method = methods.find(config.method["name"])
+    with tempfile.TemporaryDirectory() as folder:
+        workspace = RunWorkspace(Path(folder), Console(quiet=True), interval=config.checkpoint)
+        together = processes.together(torch_device(problem.device))
+        with closing(workspace), memory_errors(), one_thread(), together:
+            method.train(problem, workspace)
+
+
 def resume(directory: Path, console: Console | None = None) -> Score:
     """Continues an interrupted run, and ends with the same bits as an uninterrupted run.
 
@@ -104,6 +126,8 @@ def resume(directory: Path, console: Console | None = None) -> Score:
         Stopped: Ctrl-C or SIGTERM stopped the run.
     """
     run = RunDirectory(directory)
+    if processes.count() > 1:
+        raise TsbenchError("a run of several processes cannot be resumed: begin it again")
     if not run.begun:
         raise TsbenchError(f"there is no run in {directory}")
     with _locked(directory):
@@ -229,7 +253,14 @@ def _train(
     config: RunConfig, problem: Problem, workspace: RunWorkspace, console: Console
 ) -> Record:
     run = RunDirectory(workspace.directory)
-    policy = methods.find(config.method["name"]).train(problem, workspace)
+    name = config.method["name"]
+    with processes.together(torch_device(problem.device)):
+        # A plug-in may return anything.
+        policy: object = methods.find(name).train(problem, workspace)
+    if not isinstance(policy, Policy):
+        given = type(policy).__name__
+        raise TsbenchError(f"the method {name} returns {given}, not a Policy")
+    check_fit(policy, problem.task)
     policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
     with progress_bar(console, "evaluate") as progress:
@@ -242,7 +273,7 @@ def _train(
         task=problem.task.name,
         task_version=problem.task.version,
         standard=tasks.standard(problem.task),
-        method=config.method["name"],
+        method=name,
         seed=config.seed,
         budget=config.budget,
         score=score,

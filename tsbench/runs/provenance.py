@@ -21,6 +21,8 @@ from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_json, write_whole
 from tsbench.core.method import Problem
+from tsbench.rl import processes
+from tsbench.rl.devices import CPU, described
 from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory
 from tsbench.sim.model import compiled_hash
@@ -46,6 +48,8 @@ _NAMES = {  # the keys of `identity`, in words
     "code": "version of tsbench's own code",
     "plug-ins": "version of a plug-in",
     "physics": "model of the task",
+    "device": "GPU, driver or version of mujoco-warp",
+    "processes": "number of processes",
 }
 
 
@@ -71,7 +75,8 @@ def write_provenance(
 def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     """Hashes and versions that determine a run's results to the last bit, on one kind of machine.
 
-    They cover the configuration, Python, packages, tsbench's code, plug-ins and the physics model.
+    They cover the configuration, Python, packages, tsbench's code, plug-ins, the physics model and,
+    off the CPU, the device. On a GPU without `deterministic` they do not determine the last bits.
     """
     code = hashlib.sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
@@ -79,6 +84,11 @@ def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     configuration = json.dumps(config.identity, sort_keys=True)
     brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
     foreign = sorted(one for one in brought if one not in (None, plugins.own()))
+    where: dict[str, Any] = {}
+    if config.device != CPU:
+        where["device"] = described(config.device)
+    if processes.count() > 1:
+        where["processes"] = processes.count()
     return {
         "configuration": hashlib.sha256(configuration.encode()).hexdigest(),
         "python": platform.python_version(),
@@ -89,6 +99,7 @@ def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
             for provider in foreign
         },
         "physics": {problem.task.name: compiled_hash(problem.task.spec())},
+        **where,
     }
 
 
@@ -99,8 +110,9 @@ def check_provenance(run: RunDirectory, config: RunConfig, problem: Problem) -> 
         TsbenchError: a part of the run's identity differs from its `versions.json`.
     """
     before = run.versions()
-    for name, now in identity(config, problem).items():
-        if before.get(name) != now:
+    now = identity(config, problem)
+    for name in _NAMES:
+        if before.get(name) != now.get(name):
             raise TsbenchError(
                 f"{run.path} was begun with another {_NAMES[name]} (see {run.versions_file}), "
                 "so an exact resume is impossible: begin it again elsewhere"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
 
 from tsbench.core.arrays import Array
 from tsbench.core.errors import NotFiniteError, TsbenchError
-from tsbench.core.state import Rng, S, State
+from tsbench.core.state import Rng, S, Start, State
+from tsbench.sim.push import Push
 
 
 class Dynamics(Protocol[S]):
@@ -45,14 +46,37 @@ class LastingDynamics(Dynamics[S], Protocol[S]):
         """Restores the state of a snapshot."""
 
 
-def expect_shape(action: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Checks the shape of an action, since numpy would broadcast some wrong shapes.
+class PlacedDynamics(Dynamics[S], Protocol[S]):
+    """Full physics in which scores are played.
+
+    Attributes:
+        push: the push that disturbs the episodes, or None.
+        side_by_side: how many episodes are best played at once.
+    """
+
+    push: Push | None
+    side_by_side: int
+
+    def place(self, rows: np.ndarray, start: Start) -> S:
+        """Puts the simulations in `rows` where `start` says and returns their states."""
+
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """qpos (n, nq) and qvel (n, nv) of all simulations."""
+
+
+# Makes them: (task, count, *, threads, change).
+Engine = Callable[..., PlacedDynamics[Any]]
+
+
+def expect_shape(action: Array, shape: tuple[int, ...]) -> None:
+    """Checks the shape of an action, since libraries would broadcast some wrong shapes.
 
     Raises:
         TsbenchError: the action has another shape.
     """
-    if np.shape(action) != shape:
-        raise TsbenchError(f"the action has shape {np.shape(action)}, not {shape}")
+    found = tuple(np.shape(action))
+    if found != shape:
+        raise TsbenchError(f"the action has shape {found}, not {shape}")
 
 
 def expect_finite(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from tsbench.core.arrays import Array
 from tsbench.core.motion import Plan
+from tsbench.core.roadmap import RoadmapSpace
 from tsbench.core.state import Course, Rng, S
 from tsbench.core.task import MDP, Task, plannable
 
@@ -92,8 +93,12 @@ class Planning(MDP[S]):
         self.explore = snapshot["explore"]
 
 
-def naive_plan(task: Task[S]) -> Plan:
-    """The plan of a task's hand-made planner (`Abstraction.naive`).
+def rolled_out(task: Task[S], act: Callable[[S, int], Array]) -> Plan:
+    """The plan of a planner: its actions from the task's start to the episode's end.
+
+    Args:
+        task: to plan for.
+        act: the action (1, action_size) in a state, batch axis (1,), in a plan step.
 
     Raises:
         TsbenchError: the task has no planning variant.
@@ -104,9 +109,30 @@ def naive_plan(task: Task[S]) -> Plan:
     states = [abstraction.flatten(state)[0]]
     rewards: list[float] = []
     while len(rewards) < planning.horizon and not planning.terminal(state)[0]:
-        action = abstraction.naive(state)
+        action = act(state, len(rewards))
         following = planning.advance(state, action)
         rewards.append(float(planning.reward(state, action, following)[0]))
         states.append(abstraction.flatten(following)[0])
         state = following
     return Plan(task.name, task.version, planning.timestep, np.array(states), np.array(rewards))
+
+
+def plan_along(task: Task[S], space: RoadmapSpace[S], points: np.ndarray) -> Plan:
+    """The plan that goes through points (T + 1, d), one each plan step, as far as the planning
+    variant lets it, and stays at the last.
+
+    Raises:
+        TsbenchError: the task has no planning variant.
+    """
+    last = len(points) - 1
+    return rolled_out(task, lambda state, step: space.action(state, points[min(step + 1, last)]))
+
+
+def naive_plan(task: Task[S]) -> Plan:
+    """The plan of a task's hand-made planner (`Abstraction.naive`).
+
+    Raises:
+        TsbenchError: the task has no planning variant.
+    """
+    abstraction = plannable(task).abstraction()
+    return rolled_out(task, lambda state, _: abstraction.naive(state))

@@ -43,7 +43,10 @@ def model_path(name: str) -> Path:
         path = folder / f"{name}.xml"
         if path.is_file():
             return path
-    raise TsbenchError(f"the installation lacks models/{name}.xml: install tsbench again")
+    raise TsbenchError(
+        f"the installation lacks models/{name}.xml: install tsbench again, "
+        f"or give a plug-in's own model its package (load_spec({name!r}, __name__))"
+    )
 
 
 def load_spec(name: str, package: str = OWN) -> mujoco.MjSpec:

@@ -16,6 +16,7 @@ from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.plugins import Provider
 from tsbench.core.task import Task
+from tsbench.sim.promises import check_promises
 
 Factory = Callable[..., Task[Any]]
 
@@ -88,6 +89,17 @@ def make(name: str, **constants: Any) -> Task[Any]:
         return factory(**constants)
     except (TypeError, ValueError, OverflowError) as error:
         raise TsbenchError(f"{name} cannot be made with {constants}: {error}") from None
+
+
+def checked(name: str, **constants: Any) -> Task[Any]:
+    """The task of that name, as `make`, found to keep what tasks promise.
+
+    Raises:
+        TsbenchError: no such task or constant, or the task breaks a promise (`sim.promises`).
+    """
+    task = make(name, **constants)
+    check_promises(name, task)
+    return task
 
 
 def standard(task: Task[Any]) -> bool:

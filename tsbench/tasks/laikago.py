@@ -6,6 +6,7 @@ RL; joints of a leg in the order abduction, thigh, calf. Quaternions are (w, x, 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +22,7 @@ from tsbench.core.arrays import Array, array_namespace, filled, like
 from tsbench.core.constants import constant
 from tsbench.core.drawing import Drawing
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.roadmap import Lattice, Move, RoadmapSpace
 from tsbench.core.rotations import angle_between, multiply, to_heading, upward
 from tsbench.core.state import Course, Readings, Rng, Start, State
 from tsbench.core.task import Abstraction, Plannable, Tracker
@@ -82,6 +84,8 @@ COM_DECAY = -5.0  # 1/m, k_com, which the paper leaves out (D)
 # (docs/calibration.md).
 PLAN_TIMESTEP = 1 / 30
 PLAN_REACH = 0.15  # m, how far a planned foot may be ahead of or behind its hip (D)
+LATTICE_PARTS = 4  # of the base's largest step, at most (D)
+LATTICE_NODES = 2_000_000  # in a layer, at most (D)
 PLAN_SIGHT = 0.5  # m, beyond which the planner does not see how far the goal is (D)
 SLOWING = 0.15  # share of the way to the goal in a step, of a reference that goes on after its plan
 PLAN_HEIGHT = (0.40, 0.44)  # m, of a planned base: legs neither stretched nor folded (D)
@@ -647,6 +651,8 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         self.task = task
         self.gait = task.gait
         self.horizon = round(task.horizon * task.timestep / PLAN_TIMESTEP)
+        self.base_step = self.gait.base_speed * PLAN_TIMESTEP  # m a plan step at most
+        self.swing_step = self.gait.leg_length * self.gait.foot_speed * PLAN_TIMESTEP
 
     def start(self, count: int) -> LaikagoState:
         base = np.tile([0.0, 0.0, C.stand_height], (count, 1))
@@ -664,8 +670,7 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         action = xp.clip(action, -1.0, 1.0)
         push, step = action[..., :3], action[..., 3:]
         push = push / xp.clip(xp.linalg.vector_norm(push, axis=-1)[..., None], 1.0, None)
-        move = self.gait.base_speed * PLAN_TIMESTEP * push
-        swing = self.gait.leg_length * self.gait.foot_speed * PLAN_TIMESTEP
+        move, swing = self.base_step * push, self.swing_step
         ahead = self._ahead(state)
         # The action gives a foot's displacement in the world frame: zero leaves the foot in place.
         # A foot in stance is held, because far from the goal the reward does not punish slip. The
@@ -747,6 +752,105 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
 
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
         return poses(coordinates[:, :3], coordinates[:, 3:].reshape(-1, 4, 3))[0]
+
+    def roadmap_space(self) -> LaikagoSpace:
+        return LaikagoSpace(self)
+
+    def lattice(self) -> LaikagoLattice:
+        return LaikagoLattice(self)
+
+
+class LaikagoSpace(RoadmapSpace[LaikagoState]):
+    """Base position (3), and how far each foot is ahead of its hip (4), in metres.
+
+    It knows nothing of the gait (P). A plan that follows a way through it moves the feet as far as
+    the planning variant lets it, which holds the feet in stance.
+    """
+
+    def __init__(self, abstraction: LaikagoAbstraction) -> None:
+        self.abstraction, self.gait = abstraction, abstraction.gait
+        reach, goal = np.full(4, PLAN_REACH), abstraction.task.distance
+        beside = C.goal_tolerance / 2
+        self.low = np.array([-beside, -beside, PLAN_HEIGHT[0], *-reach])
+        self.high = np.array([goal + beside, beside, PLAN_HEIGHT[1], *reach])
+        base, foot = abstraction.base_step, abstraction.swing_step
+        self.scale = np.array([base] * 3 + [foot] * 4)
+        self.start, self.goal = (
+            np.array([x, 0.0, C.stand_height, *[0.0] * 4]) for x in (0.0, goal)
+        )
+
+    def free(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return np.ones(len(first), bool)  # the legs reach everywhere in the box
+
+    def steps(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """The base's speed is limited in any direction, each foot's by itself."""
+        moved = np.abs(second - first) / self.scale
+        base = np.linalg.norm(moved[..., :3], axis=-1)
+        steps: np.ndarray = np.maximum(base, moved[..., 3:].max(axis=-1))
+        return steps
+
+    def action(self, state: LaikagoState, point: np.ndarray) -> np.ndarray:
+        base = (point[:3] - state.base_position) / self.scale[:3]
+        feet_x = point[0] + HIPS[:, 0] + point[3:]
+        step = (feet_x - state.feet[..., 0]) / (2.0 * self.scale[3:])
+        return np.clip(np.concatenate([base, step], axis=-1), -1.0, 1.0)
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        return points[:, :3]
+
+
+class LaikagoLattice(Lattice):
+    """How far feet are ahead of their hips, in parts of the base's largest step.
+
+    Feet of the same phase move alike, so each phase of the gait is one axis. Stance feet are held,
+    and the base goes straight ahead at its height.
+    """
+
+    def __init__(self, abstraction: LaikagoAbstraction) -> None:
+        self.abstraction, self.gait = abstraction, abstraction.gait
+        self.layers = round(self.gait.period / PLAN_TIMESTEP)
+        phases, self.axis = np.unique(np.array(self.gait.phases), return_inverse=True)
+        widest = math.floor((LATTICE_NODES ** (1.0 / len(phases)) - 1.0) / 2.0)
+        parts = math.floor(widest * abstraction.base_step / PLAN_REACH)
+        self.parts = min(max(parts, 1), LATTICE_PARTS)
+        self.unit = abstraction.base_step / self.parts
+        self.reach = min(math.floor(PLAN_REACH / self.unit), widest)
+        self.shape = (2 * self.reach + 1,) * len(phases)
+        self.start = (self.reach,) * len(phases)
+
+    def moves(self, layer: int) -> list[Move]:
+        abstraction, time = self.abstraction, np.array([layer * PLAN_TIMESTEP])
+        state = abstraction.start(1).replace(time=time)
+        held = self._of_axes(self.gait.contacts(time) & self.gait.contacts(time + PLAN_TIMESTEP))
+        furthest = math.floor(abstraction.swing_step / self.unit + 1e-9)
+        found = []
+        for forward in range(self.parts + 1):
+            swing = range(-forward, furthest + 1)  # a foot in swing never goes backwards
+            for shift in itertools.product(*([-forward] if h else swing for h in held)):
+                step = self.unit * (np.array(shift)[self.axis] + forward)
+                base = [forward / self.parts, 0.0, 0.0]
+                action = np.concatenate([base, step / (2.0 * abstraction.swing_step)])
+                following = abstraction.advance(state, action[None])
+                reward = float(abstraction.task.reward(state, action, following)[0])
+                growth = math.exp(-C.distance_decay * self.unit * forward)
+                found.append(Move(shift, action, reward, growth))
+        return found
+
+    def worth(self, layer: int) -> np.ndarray:
+        time = np.array([layer * PLAN_TIMESTEP])
+        # Feet in swing bear nothing, so the worth is the same wherever they are.
+        bears = self._of_axes(self.gait.contacts(time))
+        shape = [n if b else 1 for n, b in zip(self.shape, bears, strict=True)]
+        nodes = np.indices(shape).reshape(len(shape), -1).T
+        base = np.tile([0.0, 0.0, C.stand_height], (len(nodes), 1))
+        feet_x = self.unit * (nodes - self.reach)[:, self.axis] + HIPS[:, 0]
+        state = self.abstraction.task.kinematic(np.repeat(time, len(nodes)), base, feet_x)
+        worth = self.abstraction.dynamics_reward(state)
+        return np.broadcast_to(worth.reshape(shape), self.shape)
+
+    def _of_axes(self, feet: np.ndarray) -> list[bool]:
+        """What holds of the feet of each axis, for feet (1, 4)."""
+        return [bool(feet[0, self.axis == axis].any()) for axis in range(len(self.shape))]
 
 
 class LaikagoTracker(Tracker[LaikagoState]):

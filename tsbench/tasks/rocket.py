@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -19,9 +19,10 @@ from tsbench.core.arrays import Array, array_namespace, like
 from tsbench.core.constants import constant
 from tsbench.core.drawing import Drawing, Flame
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
+from tsbench.core.roadmap import DrivableSpace
 from tsbench.core.state import Course, Readings, Rng, Start, State
 from tsbench.core.task import Abstraction, Plannable, Tracker
-from tsbench.planning.path import Path
+from tsbench.planning.path import Path, segment_distance
 from tsbench.sim.model import load_spec
 from tsbench.tasks import register
 
@@ -61,6 +62,8 @@ C = Constants()
 
 # The paper prints degrees; spec section 1 says why this is in radians.
 PLAN_TURN = 0.05  # rad per plan step (P, unit D)
+
+ROADMAP_SLACK = 1e-6  # m, by which the ways of a roadmap clear obstacles more than they must
 
 # Constants of the imitation reward, on which no score depends.
 TRACKING_DECAY = -0.625  # k_imi (P)
@@ -457,6 +460,48 @@ class RocketAbstraction(Abstraction[RocketState]):
 
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
         return coordinates
+
+    def roadmap_space(self) -> RocketSpace:
+        return RocketSpace(self.task)
+
+
+class RocketSpace(DrivableSpace[RocketState]):
+    """Positions in metres. The rocket stays upright: neither clearance nor reward depends on its
+    angle."""
+
+    near = C.success_distance
+
+    def __init__(self, task: Rocket) -> None:
+        self.obstacles = np.array(task.obstacles).reshape(-1, 2)
+        self.low, self.high = task.bounds
+        self.scale = np.full(2, C.plan_step)
+        self.start, self.goal = np.zeros(2), task.goal
+
+    def free(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """The whole way is farther from all obstacles than the audit of plans asks for."""
+        clear = np.ones(len(first), bool)
+        for obstacle in self.obstacles:
+            distance = segment_distance(obstacle, first, second)
+            clear &= distance >= C.obstacle_radius + C.hull_radius + ROADMAP_SLACK
+        return clear
+
+    def action(self, state: RocketState, point: np.ndarray) -> np.ndarray:
+        move = (point - state.position) / C.plan_step
+        return np.concatenate([move, np.zeros((1, 1))], axis=-1)
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        return np.insert(points, 1, 0.0, axis=-1)
+
+    def points(self, state: RocketState) -> np.ndarray:
+        return np.asarray(state.position)
+
+    def sent(self, state: RocketState, points: np.ndarray) -> RocketState:
+        return state.replace(position=state.position + (self.goal - points))
+
+    def moved(self, start: Start, points: np.ndarray) -> Start:
+        qpos = start.qpos.copy()
+        qpos[:, :2] += points - self.start
+        return replace(start, qpos=qpos)
 
 
 class RocketTracker(Tracker[RocketState]):

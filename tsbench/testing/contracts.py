@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,14 +19,16 @@ from tsbench import methods, tasks
 from tsbench.core.method import Budget, Problem, Snapshot
 from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.core.policy import Policy
-from tsbench.core.task import Plannable
+from tsbench.core.task import Plannable, roadmap_space
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.references import zero
+from tsbench.planning.roadmap import find_route
 from tsbench.runs import config, execute
-from tsbench.sim.kinematic import Planning
+from tsbench.sim.kinematic import Planning, plan_along, rolled_out
 from tsbench.sim.model import fingerprint
+from tsbench.sim.promises import check_promises
 from tsbench.sim.tracking import Imitation
 from tsbench.testing.episodes import (
     Case,
@@ -227,6 +229,10 @@ class TaskContract(Contract):
         assert fingerprint(task.spec()) == fingerprint(tasks.make(name).spec())
         json.dumps(dict(task.constants()))  # their hash goes into scores
 
+    def test_it_keeps_its_promises(self, name: str) -> None:
+        """Attributes, model, and shapes and types of what its functions return."""
+        check_promises(name, tasks.make(name))
+
     def test_changed_constants_are_not_standard(self, name: str) -> None:
         task = tasks.make(name)
         for constant, value in tasks.defaults(name).items():
@@ -326,11 +332,82 @@ class PlanningContract(Contract):
         for form in task.imitation_forms:
             assert Imitation(task, reference, form).horizon >= 1
 
+    def test_a_roadmap_gives_legal_plans(self, name: str) -> None:
+        """Where there is a roadmap space, a way through it is followed by legal actions, and the
+        plan's states and rewards are those of the planning variant."""
+        planning = Planning(tasks.make(name))
+        space = planning.abstraction.roadmap_space()
+        if space is None:
+            with pytest.raises(tsbench.TsbenchError, match=f"the method any cannot do {name}: "):
+                roadmap_space(planning.task, "any")
+            return
+        ends = np.stack([space.start, space.goal])
+        assert np.all((space.low <= ends) & (ends <= space.high))
+        assert space.free(ends, ends).all()
+        assert space.places(ends).shape == (2, 3)
+        one_step = space.start + np.diag(space.scale)
+        np.testing.assert_allclose(space.steps(space.start, one_step), 1.0)
+        points = find_route(space, 500, 16, seed=0).points
+        actions: list[np.ndarray] = []
+        distance: list[float] = []
+
+        def act(state: Any, step: int) -> np.ndarray:
+            actions.append(space.action(state, points[min(step + 1, len(points) - 1)]))
+            distance.append(float(planning.task.goal_distance(state)[0]))
+            return actions[-1]
+
+        plan = rolled_out(planning.task, act)
+        check_replay(planning, plan, actions)
+        np.testing.assert_array_equal(plan_along(planning.task, space, points).states, plan.states)
+        assert distance[-1] < 0.2 * distance[0]
+
+    def test_a_lattice_gives_legal_plans(self, name: str) -> None:
+        """Where there is a lattice, any moves from its start are legal actions, and their rewards
+        are those that it says."""
+        planning = Planning(tasks.make(name))
+        lattice = planning.abstraction.lattice()
+        if lattice is None:
+            return
+        moves = [lattice.moves(layer) for layer in range(lattice.layers)]
+        worth = [lattice.worth(layer) for layer in range(lattice.layers)]
+        rng, node, growth = np.random.default_rng(0), np.array(lattice.start), 1.0
+        actions, rewards = [], []
+        for step in range(2 * lattice.layers):
+            layer = step % lattice.layers
+            inside = [
+                move
+                for move in moves[layer]
+                if np.all((node + move.shift >= 0) & (node + move.shift < lattice.shape))
+            ]
+            move = inside[rng.integers(len(inside))]
+            node = node + move.shift
+            following = worth[(layer + 1) % lattice.layers]
+            rewards.append(growth * move.reward * following[tuple(node)])
+            growth *= move.growth
+            actions.append(move.action[None])
+        taken = iter(actions)
+        idle = np.zeros((1, planning.action_size))
+        plan = rolled_out(planning.task, lambda *_: next(taken, idle))
+        check_replay(planning, plan, actions)
+        np.testing.assert_allclose(plan.rewards[: len(rewards)], rewards, rtol=1e-6)
+
     @pytest.mark.parametrize("regime", ["uniform", "small"])
     def test_both_simulations_of_the_imitation_agree(self, name: str, regime: str) -> None:
         task, rng = Imitation(tasks.make(name), reference_of(name)), np.random.default_rng(5)
         starts = task.start(rng, 3)
         compare(task, starts, REGIMES[regime](rng, (task.horizon, 3, task.action_size)))
+
+
+def check_replay(planning: Planning[Any], plan: Plan, actions: Sequence[np.ndarray]) -> None:
+    """The actions are legal, and lead to the plan's states and rewards again."""
+    assert np.abs(np.concatenate(actions)).max() <= 1.0 + 1e-9
+    abstraction = planning.abstraction
+    state = abstraction.start(1)
+    np.testing.assert_array_equal(plan.states[0], abstraction.flatten(state)[0])
+    for action, coordinates, reward in zip(actions, plan.states[1:], plan.rewards, strict=False):
+        before, state = state, abstraction.advance(state, np.clip(action, -1.0, 1.0))
+        np.testing.assert_allclose(coordinates, abstraction.flatten(state)[0], atol=1e-9)
+        assert reward == pytest.approx(float(planning.reward(before, action, state)[0]), abs=1e-9)
 
 
 @dataclass
@@ -387,6 +464,11 @@ def bits(policy: Policy) -> bytes:
     return b"".join(array.tobytes() for array in arrays)
 
 
+def required(item: Field[Any]) -> bool:
+    """Whether a field of a dataclass has no default."""
+    return item.default is MISSING and item.default_factory is MISSING
+
+
 class MethodContract:
     """Tests of a method.
 
@@ -426,7 +508,8 @@ class MethodContract:
     def test_its_options_are_in_its_configuration(self, name: str) -> None:
         """`key=value` words and `--cfg job` find a method's options in its configuration file."""
         options = methods.find(name).Options
-        assert options() == options()
+        without = [item.name for item in fields(options) if required(item)]
+        assert not without, f"fields of Options without a default: {without}"
         chosen = config.compose([f"task={self.task}", f"method={name}"]).method
         assert chosen == {**vars(options()), "name": name}
 

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tsbench.core.drawing import Lines
 from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import Roadmap
 from tsbench.viewer.framing import reach
 from tsbench.viewer.props import balance_marks, contact_marks, flames, planned_marks, push_arrows
 from tsbench.viewer.recording import Recording
@@ -20,6 +22,8 @@ from tsbench.viewer.show import (
     PAPER,
     PLAN_COLOUR,
     PUSH_COLOUR,
+    ROADMAP_COLOUR,
+    WAY_COLOUR,
     Actor,
     Band,
     Curve,
@@ -31,6 +35,9 @@ from tsbench.viewer.show import (
 from tsbench.viewer.stage import stage
 
 LANE = 2.0  # robot sizes between two robots that are shown side by side
+
+MOST_EDGES = 4000  # of a roadmap that are drawn
+ROADMAP_NOTE = f"straight ways that are free, the shortest {MOST_EDGES:,} at most"
 
 EXECUTED_NOTE = "the policy's motion in full physics; its path is orange"
 PLAN_NOTE = "the planned motion, without physics; translucent"
@@ -52,6 +59,7 @@ def compose(
     title: str,
     verdict: str = "",
     summary: Sequence[tuple[str, str]] = (),
+    roadmap: Roadmap | None = None,
 ) -> Show:
     """The show of one policy and the plan that it follows. Without a plan, the scheduled contacts
     are drawn below the feet of the robot.
@@ -60,6 +68,7 @@ def compose(
         recording: the executed motion.
         plan: the planned motion.
         title, verdict, summary: see `Show`.
+        roadmap: that the plan was made with.
     """
     name, guide = "executed", plan or recording
     actors = [Actor(name, recording.qpos, recording.task.timestep, EXECUTED_COLOUR, EXECUTED_NOTE)]
@@ -79,8 +88,10 @@ def compose(
     legend += [GLOW] if drawing.worth else []
     arrows = push_arrows(name, recording)
     legend += [PUSH] if arrows else []
+    drawn = roadmap_lines(roadmap)
+    legend += [Entry(one.name, one.colour, one.note) for one in drawn]
     return Show(
-        model=stage(recording),
+        model=stage(recording, lines=drawn),
         actors=actors,
         title=title,
         verdict=verdict,
@@ -91,19 +102,36 @@ def compose(
     )
 
 
-def compose_plan(plan: Recording, *, title: str, verdict: str = "") -> Show:
-    """The show of a plan alone."""
+def compose_plan(
+    plan: Recording, *, title: str, verdict: str = "", roadmap: Roadmap | None = None
+) -> Show:
+    """The show of a plan alone, or with the roadmap that it was made with."""
     drawing = plan.task.drawing()
     marks = planned_marks("plan", plan) if drawing.feet else []
+    drawn = roadmap_lines(roadmap)
+    legend = [Entry(one.name, one.colour, one.note) for one in drawn]
     return Show(
-        model=stage(plan),
+        model=stage(plan, lines=drawn),
         actors=[_plan_actor(plan)],
         title=title,
         verdict=verdict,
         props=marks,
-        legend=([STAND_PLANNED] if marks else []) + ([GLOW] if drawing.worth else []),
+        legend=[STAND_PLANNED] * bool(marks) + [GLOW] * bool(drawing.worth) + legend,
         timeline=[*foot_bands(plan, None), *_curves([(PLAN_COLOUR, plan)])],
     )
+
+
+def roadmap_lines(roadmap: Roadmap | None) -> list[Lines]:
+    """The roadmap's shortest edges, and the way through it."""
+    if roadmap is None:
+        return []
+    edges = roadmap.nodes[roadmap.edges]
+    order = np.argsort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=-1), kind="stable")
+    way = np.stack([roadmap.path[:-1], roadmap.path[1:]], axis=1)
+    return [
+        Lines("roadmap", ROADMAP_NOTE, ROADMAP_COLOUR, edges[order[:MOST_EDGES]], 0.0005),
+        Lines("way", "the way through the roadmap that the plan follows", WAY_COLOUR, way, 0.0015),
+    ]
 
 
 def _plan_actor(plan: Recording) -> Actor:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
-from tsbench.core.drawing import Drawing
+from tsbench.core.drawing import Drawing, Lines
 from tsbench.core.errors import TsbenchError
 from tsbench.viewer.framing import reach
 from tsbench.viewer.recording import Recording
@@ -17,12 +19,13 @@ from tsbench.viewer.show import INK, SKY
 MAP_PIXELS = 240  # along the longer side of a reward map
 
 
-def stage(recording: Recording, lane: float = 0.0) -> mujoco.MjModel:
+def stage(recording: Recording, lane: float = 0.0, lines: Sequence[Lines] = ()) -> mujoco.MjModel:
     """The task's model with the world's border, the reward map, and a copy of the goal in a lane.
 
     Args:
         recording: a recording of the task.
         lane: metres along y from the goal to its copy; 0 for no copy.
+        lines: to draw in addition to the task's own.
 
     Raises:
         TsbenchError: the world has bounds and is not flat across y.
@@ -34,12 +37,13 @@ def stage(recording: Recording, lane: float = 0.0) -> mujoco.MjModel:
             type=goal.type, pos=np.add(goal.pos, (0.0, lane, 0.0)), size=goal.size, rgba=goal.rgba
         )
     behind = 2.05 * reach(recording.task.spec().compile(), recording.qpos[0])[0]
-    furnish(spec, recording.task.drawing(), behind)
+    drawing = recording.task.drawing()
+    furnish(spec, replace(drawing, lines=(*drawing.lines, *lines)), behind)
     return spec.compile()
 
 
 def furnish(spec: mujoco.MjSpec, drawing: Drawing, behind: float) -> None:
-    """Adds the world's border and the reward map to a model, without contacts.
+    """Adds lines, the world's border and the reward map to a model, without contacts.
 
     Args:
         spec: the task's model.
@@ -49,6 +53,8 @@ def furnish(spec: mujoco.MjSpec, drawing: Drawing, behind: float) -> None:
     Raises:
         TsbenchError: the world has bounds and is not flat across y.
     """
+    for number, lines in enumerate(drawing.lines):
+        _lines(spec, f"lines_{number}", lines)
     if drawing.bounds is None:
         return
     low, high = drawing.bounds
@@ -64,6 +70,44 @@ def furnish(spec: mujoco.MjSpec, drawing: Drawing, behind: float) -> None:
         _line(spec, begin, end, width, (*INK, 1.0))
     if drawing.worth is not None:
         _reward_map(spec, drawing, behind)
+
+
+def _lines(spec: mujoco.MjSpec, name: str, lines: Lines) -> None:
+    """Adds all lines as one mesh, of a three-sided tube for each, which costs a picture little."""
+    first, second = lines.segments[:, 0], lines.segments[:, 1]
+    along = second - first
+    first, second, along = (ends[along.any(axis=-1)] for ends in (first, second, along))
+    if not len(along):
+        return
+    size = float(np.linalg.norm(np.ptp(lines.segments.reshape(-1, 3), axis=0)))
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    least = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
+    side = np.cross(along, least)
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    other = np.cross(along, side)
+    angle = 2.0 * math.pi / 3.0 * np.arange(3)
+    around = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * other[:, None]
+    ring = lines.width * size / 2.0 * around  # (m, 3, 3)
+    vertices = np.concatenate([first[:, None] + ring, second[:, None] + ring], axis=1)
+    faces = np.array(
+        [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5], [0, 2, 1], [3, 4, 5]]
+    )
+    spec.add_mesh(
+        name=name,
+        uservert=vertices.ravel(),
+        userface=(6 * np.arange(len(vertices))[:, None, None] + faces).ravel(),
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+    )
+    spec.add_material(name=name, rgba=[*lines.colour, 1.0], emission=0.4, specular=0.0)
+    spec.worldbody.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        material=name,
+        contype=0,
+        conaffinity=0,
+        group=2,
+    )
 
 
 def _line(

@@ -11,7 +11,7 @@ import numpy as np
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError
-from tsbench.core.motion import Plan, ReferenceMotion, read_motion
+from tsbench.core.motion import Plan, ReferenceMotion, Roadmap, read_motion
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.evaluation.words import summary
@@ -36,6 +36,7 @@ class Subject:
         policy: the policy, or None.
         reference: the plan as full poses, or None.
         score: the content of `score.json`, or None.
+        roadmap: the roadmap that the plan was made with, or None.
     """
 
     title: str
@@ -43,6 +44,7 @@ class Subject:
     policy: Policy | None
     reference: ReferenceMotion | None
     score: Record | None = None
+    roadmap: Roadmap | None = None
 
     def plan(self) -> Recording | None:
         """The reference motion as a recording; None without one."""
@@ -64,7 +66,8 @@ class Subject:
             if force is not None:
                 raise TsbenchError("a plan cannot be pushed, only a policy")
             assert plan is not None
-            return compose_plan(plan, title=self.title, verdict=planned_in_words(plan))
+            verdict = planned_in_words(plan)
+            return compose_plan(plan, title=self.title, verdict=verdict, roadmap=self.roadmap)
         recording = record_episode(self.task, self.policy, force)
         check_pushed(force, [recording])
         return self.show_of(recording, plan)
@@ -78,6 +81,7 @@ class Subject:
             title=self.title,
             verdict=" ".join([*sentences, executed_in_words(recording)]),
             summary=summary(self.score.score, self.task) if self.score else (),
+            roadmap=self.roadmap,
         )
 
 
@@ -89,7 +93,7 @@ def subject(word: str) -> Subject:
         TsbenchError: the task, directory or file does not exist, or is damaged.
     """
     if word.startswith("task="):
-        return task_subject(tasks.make(word.removeprefix("task=")))
+        return task_subject(tasks.checked(word.removeprefix("task=")))
     path = Path(word)
     if path.is_dir() or not path.exists():
         return run_subject(RunDirectory(path))
@@ -119,6 +123,7 @@ def run_subject(run: RunDirectory) -> Subject:
         policy=policy,
         reference=run.reference(task),
         score=score,
+        roadmap=run.roadmap(task),
     )
 
 
@@ -129,12 +134,13 @@ def plan_subject(path: Path) -> Subject:
         TsbenchError: the file is damaged, holds neither a plan nor a reference motion, or is for
             another version of its task.
     """
-    motion = read_motion(path)
-    task = plannable(RunDirectory(path.parent).task(motion.task))
+    motion, run = read_motion(path), RunDirectory(path.parent)
+    task = plannable(run.task(motion.task))
     task.check_fit(motion)
     if isinstance(motion, Plan):
         motion = task.reference(motion)
-    return Subject(f"{task.name}, {path.name}", task, None, motion)
+    title = f"{task.name}, {path.name}"
+    return Subject(title, task, None, motion, roadmap=run.roadmap(task))
 
 
 def pair(runs: Sequence[str], push: str | None = None) -> Show:

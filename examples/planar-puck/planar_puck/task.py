@@ -88,9 +88,6 @@ class PuckGap(Plannable[PuckState]):
         qpos, qvel = perturbed * self.spread * rng.uniform(-1.0, 1.0, (2, count, 2))
         return Start(np.zeros(count), qpos, qvel, np.zeros((count, 0)))
 
-    def control(self, state: PuckState, action: Array) -> tuple[Array, Array]:
-        return array_namespace(action).clip(action, -1.0, 1.0), self.memory(state)
-
     def read(self, readings: Readings) -> PuckState:
         return PuckState(readings.time, readings.qpos, readings.qvel)
 

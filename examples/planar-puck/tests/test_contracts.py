@@ -1,5 +1,6 @@
 """What tsbench asks of every task and method."""
 
+from tsbench.core.method import Budget
 from tsbench.testing import ArrayContract, MethodContract, PlanningContract, TaskContract
 
 
@@ -18,3 +19,9 @@ class TestPuckArrays(ArrayContract):
 class TestByHand(MethodContract):
     names = ("by_hand",)
     task = "puck_gap"
+
+
+class TestRandomSearch(MethodContract):
+    names = ("random_search",)
+    task = "puck_gap"
+    budget = Budget(plan=2_000, act=1_000)  # a trial takes up to 800 steps
