@@ -6,10 +6,12 @@
 # make bench    measure speed
 # make compare  measure speed beside other libraries, such as ARGS='--only sb3'
 # make gpu-bundle  collect what a machine with a GPU and without a network lacks
+# make study    run the trainings of the paper's results, or go on with them: OUT=results/paper
 # make clean    remove the files that make and the tests have made, but not runs/
 #
 # `make run` hands its key=value words to `tsbench run`. Words in capitals are for make: ARGS holds
-# other words, such as ARGS='-m seed=0,1', N the number of kills, PYTHON the interpreter.
+# other words, such as ARGS='-m seed=0,1', N the number of kills, OUT the results folder, PYTHON the
+# interpreter.
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
@@ -28,10 +30,10 @@ empty :=
 space := $(empty) $(empty)
 plain = $(subst \\,\,$(subst $$$$,$$,$(subst <blank>,$(space),$1)))
 quoted = '$(subst ','\'',$(call plain,$1))'
-given = $(filter-out ARGS=% PYTHON=% N=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
+given = $(filter-out ARGS=% PYTHON=% N=% OUT=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
 words = $(if $(filter task=%,$(given)),,task=laikago_trot) $(foreach word,$(given),$(call quoted,$(word)))
 
-.PHONY: help setup system run test check format faults bench compare gpu-bundle clean
+.PHONY: help setup system run test check format faults bench compare gpu-bundle study clean
 
 help:
 	@sed -n 's/^# \(make .*\)/  \1/p' Makefile
@@ -82,6 +84,10 @@ compare: setup $(EXTRAS)
 
 gpu-bundle: setup
 	@$(BIN)/python benchmarks/bundle.py $(ARGS)
+
+OUT ?= results/paper
+study: setup
+	@$(BIN)/python benchmarks/study.py benchmarks/paper.txt --out $(OUT) $(ARGS)
 
 clean:
 	rm -rf $(VENV) build dist screenshots .mypy_cache .pytest_cache .ruff_cache .hypothesis

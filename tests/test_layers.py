@@ -125,10 +125,11 @@ def test_tasks_and_methods_do_not_know_their_like() -> None:
 
 
 def test_nothing_lists_tasks_or_methods() -> None:
-    """Outside the file of a task or method no string of the package is its name."""
+    """Outside the file of a task or method no string of the package is its name, except where the
+    paper's figures say which methods are the paper's."""
     listed = {*tasks.names(), *methods.names()}
     for name, tree in MODULES.items():
-        if room(name) not in ("tasks", "methods"):
+        if room(name) not in ("tasks", "methods") and name != "tsbench.viewer.paper.exhibit":
             strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
             assert not strings & listed, name
 

@@ -193,7 +193,7 @@ def test_the_configuration_can_be_shown(capsys: pytest.CaptureFixture[str], tmp_
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("tsbench ", "run evaluate view report tune export submit verify leaderboard bench list"),
+        ("tsbench ", " ".join(verbs.VERBS)),
         ("tsbench run task=rocket_n", "task=rocket_navigation"),
         ("tsbench run task=rocket_navigation bud", "budget="),
     ],

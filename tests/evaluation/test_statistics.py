@@ -139,6 +139,7 @@ def test_paired_differences_by_hand() -> None:
     back = paired_difference(second, first)
     assert (back.mean, back.p_value) == (-3.0, found.p_value)
     assert paired_difference(first, first).p_value == 1.0
+    assert paired_difference(by_seed(3), by_seed(1)).p_value == 1.0  # one pair, either way round
     # Two tasks with equal weight: means of 3 over 5 seeds, and of -1 over 1.
     two = paired_difference({**first, "more": {7: 0.0}}, {**second, "more": {7: 1.0}})
     assert two.mean == 1.0

@@ -93,6 +93,7 @@ def test_steps_are_counted() -> None:
         # 3 m: 0.52 s to fly and half as long again, 0.78 s, are 15 planning steps.
         assert metrics["episode_length"] == 15.0
         assert 0.0 < metrics["episode_return"] < 15 * 0.9
+        assert metrics["normalized_return"] == metrics["episode_return"] / (15 * 0.9)
 
 
 @pytest.mark.parametrize("update", ["numpy", "rsl_rl"])

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -432,6 +433,14 @@ def test_a_plan_that_fails_its_audit_ends_the_run(tmp_path: Path) -> None:
     assert "resume" not in str(caught.value)
     assert (tmp_path / "mine" / "plan.npz").exists()
     assert not (tmp_path / "mine" / "policy.safetensors").exists()
+
+
+def test_a_plan_alone_is_not_removed(tmp_path: Path, naive_plan: Callable[[str], Plan]) -> None:
+    """A roadmap's plan may fail its audit before anything is learned; the error names its place."""
+    place = RunDirectory(tmp_path)
+    assert not place.trained
+    naive_plan("rocket_navigation").save(place.plan_file)
+    assert place.trained
 
 
 # A goal so near that an episode takes 1.5 s.

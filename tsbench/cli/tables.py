@@ -16,6 +16,7 @@ from tsbench.evaluation.flips import Flips
 from tsbench.evaluation.score import Score
 from tsbench.evaluation.words import FIGURES, counts, episode_rows, push_rows, verdict
 from tsbench.runs.directory import Record, RunDirectory
+from tsbench.viewer.paper import scores
 
 HEADLINES = ("solved_reward", "normalized_reward", "against_plan")
 
@@ -69,6 +70,21 @@ def show_run(console: Console, record: Record, task: Task[Any]) -> None:
         table.add_row(stage.name, f"{stage.steps:,}", duration(stage.seconds))
     console.print(table)
     show_rank(console, record.standard, record.score)
+
+
+def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
+    """Prints the scores of many runs: a table for each task, a column for each method."""
+    for task in dict.fromkeys(line.group.task for line in lines):
+        own = [line for line in lines if line.group.task == task]
+        table = Table(title=task, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        for header in ("", *(line.group.label for line in own)):
+            table.add_column(escape(header), overflow="fold")
+        columns = [scores.cells(line) for line in own]
+        for row in zip(scores.COLUMNS[2:-1], *(one[2:-1] for one in columns), strict=True):
+            table.add_row(*(escape(one.replace(" [", "\n[")) for one in row))
+        for name in own[0].measures:
+            table.add_row(name, *(number(line.measures[name]) for line in own))
+        console.print(table)
 
 
 def show_places(console: Console, run: RunDirectory) -> None:

@@ -143,6 +143,9 @@ def _dispatch(words: list[str]) -> int:
     elif words[0] in VERBS:
         if words[0] == "view" and any(w.startswith(PICTURES) for w in words):
             find_working_backend()
+        if words[0] == "figures":
+            with suppress(TsbenchError):  # only the motion strips are then left out
+                find_working_backend()
         _check_graphics()
         return VERBS[words[0]].call(words[1:]) or 0
     else:
@@ -565,6 +568,45 @@ def _tune(words: Sequence[str]) -> None:
     write_json(options.json, {**figures, "seeds": study.seeds})
 
 
+def _collect(words: Sequence[str]) -> None:
+    parser = _parser("collect", json=False)
+    what = "runs, entries, results folders, or folders with such in them"
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS", help=what)
+    out = "the results folder, which is made where there is none"
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=out)
+    trials = "trials that were spent on tuning the settings of these runs"
+    parser.add_argument("--trials", type=_trials, metavar="N", help=trials)
+    options = parser.parse_args(words)
+    from tsbench.runs import results
+
+    found = results.read(options.runs)
+    kept = results.collect(found, options.out, options.trials)
+    sys.stdout.write(f"{options.out}: {len(found.rows)} added, {len(kept.rows)} in all\n")
+
+
+def _trials(word: str) -> int:
+    return _whole_number(word, 0, 10**6)
+
+
+def _figures(words: Sequence[str]) -> None:
+    parser = _parser("figures", json=False)
+    what = "runs, entries, results folders, or folders with such in them"
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS", help=what)
+    out = "a new folder, which gets index.html and the figures as PNG, SVG and CSV"
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=out)
+    options = parser.parse_args(words)
+    from tsbench.cli import tables
+    from tsbench.runs import results
+    from tsbench.viewer.paper import page
+
+    lines, remarks = page.write(results.read(options.runs), options.out)
+    console = Console()
+    tables.show_scores(console, lines)
+    for line in remarks:
+        console.print(f" {line}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f" {options.out / 'index.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
 def _bench(words: Sequence[str]) -> None:
     parser = _parser("bench")
     parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
@@ -818,6 +860,8 @@ VERBS = {
     "view": Verb("show a run, a plan or a task in motion: live, as a page or as a video", _view),
     "report": Verb("write one page about a run: plan, motion, score and learning", _report),
     "tune": Verb("search for good settings of a method, shared by processes", _tune),
+    "collect": Verb("keep the scores, curves and best policies of many runs as data", _collect),
+    "figures": Verb("make the paper's figures and its table again, from runs or results", _figures),
     "export": Verb("write a policy of another library as tsbench's own file", _export),
     "submit": Verb("pack runs into an entry of the leaderboard", _submit),
     "verify": Verb("check whether entries of the leaderboard hold what they claim", _verify),

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tsbench.core.state import State
+
 
 @dataclass(frozen=True)
 class Flame:
@@ -59,6 +61,8 @@ class Drawing:
             flat world both corners have the same coordinate along the normal of its plane.
         worth: positions (n, 3) in metres -> reward of a robot at each position (n,); drawn within
             the bounds of a flat world.
+        still: positions (n, 3) in metres -> the states of a robot at rest there; for maps of other
+            rewards than `worth`.
         lines: lines of the world.
     """
 
@@ -67,4 +71,5 @@ class Drawing:
     flames: tuple[Flame, ...] = ()
     bounds: tuple[np.ndarray, np.ndarray] | None = None
     worth: Callable[[np.ndarray], np.ndarray] | None = None
+    still: Callable[[np.ndarray], State] | None = None
     lines: tuple[Lines, ...] = ()

@@ -13,6 +13,11 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
+def several(count: int, what: str) -> str:
+    """A count of things: "1 seed", "2 seeds"."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def number(value: Any) -> str:
     """A number as text: a float with four significant digits; a dash for None, infinity or NaN."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):

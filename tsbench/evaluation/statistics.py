@@ -155,18 +155,20 @@ def paired_difference(
     )
     ranked = standing(pairs) == "ranked"
     shares = np.concatenate([sample / (len(sample) * len(pairs)) for sample in pairs])
-    test = permutation_test(
-        (shares,),
-        lambda signed, axis=-1: signed.sum(axis=axis),
-        permutation_type="samples",
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        rng=np.random.default_rng(seed),
-    )
+    p_value = 1.0  # of a single pair, whose mean is as far from zero the other way round
+    if len(shares) > 1:
+        p_value = permutation_test(
+            (shares,),
+            lambda signed, axis=-1: signed.sum(axis=axis),
+            permutation_type="samples",
+            vectorized=True,
+            n_resamples=RESAMPLES,
+            rng=np.random.default_rng(seed),
+        ).pvalue
     return Difference(
         mean=float(_mean(*pairs)),
         interval=_interval(pairs, _mean, seed) if ranked else None,
-        p_value=float(test.pvalue),
+        p_value=float(p_value),
     )
 
 

@@ -45,7 +45,7 @@ SLOWNESS, PATIENCE = 2.0, 2.0  # an edge may take this times the planner's secon
 ERRAND = 8.0  # s, of an episode of learning to drive
 ROUNDS = 8  # of DAgger
 EPOCHS, LAST = 10, 50  # passes over all that was seen, in a round and in the last one
-FLIGHTS = 32  # episodes in a round, at most
+FLIGHTS = 128  # episodes in a round, at most
 CONFIDENCE = 0.95  # of the Wilson bounds
 
 

@@ -161,6 +161,10 @@ class Learner:
                     "std": std,
                     **env.finished(),
                 }
+                if "episode_return" in metrics:
+                    mdp = self.environment.mdp
+                    largest = mdp.max_reward * mdp.horizon
+                    metrics["normalized_return"] = metrics["episode_return"] / largest
                 report(self.steps, metrics)
 
     def _expect_finite(self, losses: Mapping[str, float]) -> None:

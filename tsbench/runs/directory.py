@@ -149,8 +149,9 @@ class RunDirectory:
 
     @property
     def trained(self) -> bool:
-        """Whether the directory holds training progress, so that it must not be removed."""
-        return self.metrics_file.exists() and self.metrics_file.stat().st_size > 0
+        """Whether the directory holds training progress or a plan, which must not be removed."""
+        metrics = self.metrics_file
+        return (metrics.exists() and metrics.stat().st_size > 0) or self.plan_file.exists()
 
     @property
     def finished(self) -> bool:

@@ -292,13 +292,16 @@ class Rocket(Plannable[RocketState]):
     def drawing(self) -> Drawing:
         low, high = (np.array([x, 0.0, z]) for x, z in self.bounds)
 
+        def still(position: np.ndarray) -> RocketState:
+            zeros = np.zeros(len(position))
+            return self.kinematic(zeros, position[:, [0, 2]], zeros)
+
         def worth(position: np.ndarray) -> np.ndarray:
-            still = np.zeros(len(position))
-            state = self.kinematic(still, position[:, [0, 2]], still)
-            reward: np.ndarray = self.reward(state, still, state)
+            state = still(position)
+            reward: np.ndarray = self.reward(state, state.time, state)
             return reward
 
-        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth)
+        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth, still=still)
 
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """At the origin, at rest, upright (P).

@@ -1,0 +1,154 @@
+"""Kept results: what a run leaves in them, how they are merged, and which policies stay."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import write_json
+from tsbench.core.motion import Plan
+from tsbench.core.task import plannable
+from tsbench.runs import config, results
+from tsbench.runs.directory import Record, RunDirectory
+from tsbench.runs.execute import prepare
+from tsbench.runs.provenance import write_provenance
+from tsbench.runs.results import POINTS, Result, Results
+
+ROCKET = ["task=rocket_navigation", "budget=smoke"]
+
+
+def begin(path: Path, words: list[str], points: int = 5) -> RunDirectory:
+    """A run that has begun, and has learned for so many iterations."""
+    path.mkdir(parents=True)
+    run, chosen = RunDirectory(path), config.compose(words)
+    write_provenance(run, chosen, prepare(chosen), words)
+    rows = [
+        {"stage": "plan", "steps": 10 * i, "seconds": float(i), "normalized_return": i / points}
+        for i in range(1, points + 1)
+    ]
+    run.metrics_file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return run
+
+
+def finish(run: RunDirectory, record: Record, solved_reward: float = 0.004) -> None:
+    score = record.score
+    perturbed = replace(score.perturbed, solved_reward=solved_reward)
+    chosen = run.config()
+    record = replace(
+        record,
+        seed=chosen.seed,
+        budget=chosen.budget,
+        method=str(chosen.method["name"]),
+        score=replace(score, solved_reward=solved_reward, perturbed=perturbed),
+    )
+    write_json(run.score_file, record.as_dict())
+    for path in (run.policy_info_file, run.policy_file):
+        path.write_text(f"seed {chosen.seed}")
+
+
+def only(found: Results | None) -> Result:
+    assert found is not None
+    (row,) = found.rows.values()
+    return row
+
+
+def test_a_run_is_named_by_the_words_that_decide_its_result() -> None:
+    given = ["seed=3", "threads=2", "++task.constants.distance=24", "task=rocket_navigation"]
+    found = results.words_of(config.compose(given), given)
+    assert found == (
+        "task=rocket_navigation", "method=twostage", "budget=fast", "seed=3",
+        "task.constants.distance=24",
+    )  # fmt: skip
+
+
+def test_a_finished_run_is_kept_with_its_words_distance_and_thin_curves(
+    tmp_path: Path, invented_record: Callable[[str], Record]
+) -> None:
+    run = begin(tmp_path / "run", [*ROCKET, "seed=1", "task.constants.distance=24"], points=1000)
+    assert results.of_run(run) is None
+    finish(run, invented_record("rocket_navigation"))
+    found = results.of_run(run)
+    row = only(found)
+    assert (row.seed, row.distance, row.standard, row.success) == (1, 24.0, False, 0.4)
+    assert row.command.endswith("seed=1 task.constants.distance=24")
+    assert found is not None
+    (curve,) = found.curves[row.words]
+    assert len(curve.steps) == POINTS
+    assert (curve.steps[0], curve.steps[-1], curve.returns[-1]) == (10, 10_000, 1)
+
+
+def test_a_plan_that_fails_its_audit_is_a_result_of_zero(
+    tmp_path: Path, naive_plan: Callable[[str], Plan]
+) -> None:
+    """The hand-made planner flies straight, too near to the obstacles."""
+    words = ["task=rocket_obstacles", "budget=smoke"]
+    for name, audit in (("stop", "stop"), ("warn", "warn")):
+        run = begin(tmp_path / name, [*words, f"method.audit={audit}"])
+        plan = naive_plan("rocket_obstacles")
+        plan.save(run.plan_file)
+        plannable(run.task("rocket_obstacles")).reference(plan).save(run.reference_file)
+    row = only(results.of_run(RunDirectory(tmp_path / "stop")))
+    assert "missing clearance from obstacle 1" in row.failure
+    assert (row.solved_reward, row.normalized_reward, row.success, row.steps) == (0, 0, 0, 50)
+    assert results.of_run(RunDirectory(tmp_path / "warn")) is None  # it may still be finished
+
+
+def test_results_are_read_as_they_were_kept_and_merged_by_their_words(
+    tmp_path: Path, invented_record: Callable[[str], Record]
+) -> None:
+    record, out = invented_record("rocket_navigation"), tmp_path / "results"
+    for seed in range(2):
+        run = begin(tmp_path / "runs" / str(seed), [*ROCKET, f"seed={seed}"])
+        finish(run, record, solved_reward=0.1 * seed)
+    kept = results.collect(results.read([tmp_path / "runs"]), out, trials=12)
+    assert results.load(out).rows == kept.rows
+    assert [row.trials for row in kept.rows.values()] == [12, 12]
+    for words, curves in results.load(out).curves.items():
+        for one, other in zip(curves, kept.curves[words], strict=True):
+            np.testing.assert_array_equal(one.returns, other.returns)
+    again = begin(tmp_path / "again", [*ROCKET, "seed=1"])
+    finish(again, record, solved_reward=0.7)
+    merged = results.collect(results.read([again.path]), out)
+    assert [(row.solved_reward, row.trials) for row in merged.rows.values()] == [(0, 12), (0.7, 12)]
+    assert results.read([out]).rows == merged.rows
+
+
+def test_the_policies_of_the_best_the_median_and_the_worst_seed_stay(
+    tmp_path: Path, invented_record: Callable[[str], Record]
+) -> None:
+    record, out = invented_record("rocket_navigation"), tmp_path / "results"
+
+    def kept() -> set[str]:
+        return {path.parent.name[:5] for path in out.rglob("policy.json")}
+
+    for seed, worth in enumerate((0.3, 0.1, 0.5, 0.2, 0.4)):
+        run = begin(tmp_path / "runs" / str(seed), [*ROCKET, f"seed={seed}"])
+        finish(run, record, solved_reward=worth)
+        results.collect(results.read([run.path]), out)
+    assert kept() == {"seed1", "seed0", "seed2"}
+    other = begin(tmp_path / "other", [*ROCKET, "seed=5", "task.constants.distance=24"])
+    finish(other, replace(record, standard=False))
+    results.collect(results.read([other.path]), out)
+    assert kept() == {"seed1", "seed0", "seed2"}  # changed tasks are for their scores alone
+    best = begin(tmp_path / "best", [*ROCKET, "seed=6"])
+    finish(best, record, solved_reward=0.9)
+    found = results.collect(results.read([best.path]), out)
+    # The median is now one of two; seed 4 has gone, so that seed 0 stays for it.
+    assert {found.rows[words].seed for words in found.folders} == {0, 1, 6}
+    assert len(found.rows) == 7
+
+
+def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TsbenchError, match="no directory"):
+        results.read([tmp_path / "nowhere"])
+    with pytest.raises(TsbenchError, match="holds no finished run, no entry and no results"):
+        results.read([tmp_path])
+    (tmp_path / results.ROWS).write_text('{"task": 3}\n')
+    with pytest.raises(TsbenchError, match=r"damaged results .*runs\.jsonl, line 1: task must be"):
+        results.read([tmp_path])

@@ -1,0 +1,86 @@
+"""The study of benchmarks/: what it does not run again, what it begins again, and what it keeps."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import pytest
+
+from tsbench.core.files import write_json
+from tsbench.runs import results
+from tsbench.runs.directory import RunDirectory
+
+SPEC = spec_from_file_location("study", Path(__file__).parents[1] / "benchmarks" / "study.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+STUDY = module_from_spec(SPEC)
+sys.modules["study"] = STUDY  # where dataclasses look for the types of their fields
+SPEC.loader.exec_module(STUDY)
+SMALL = (
+    "task=rocket_navigation method=twostage budget=smoke task.budgets.smoke.plan=1_024 "
+    "task.budgets.smoke.act=1_024 task.training.plan.rollout=32 task.training.imitate.rollout=32"
+)
+
+
+Study = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(name="study")
+def study_fixture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Study:
+    """A function that does a study of these lines, and returns its status, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def study(*lines: str, options: tuple[str, ...] = ()) -> tuple[int, str, str]:
+        Path("study.txt").write_text("\n".join(lines))
+        status = STUDY.main(["study.txt", "--out", "kept", "--jobs", "2", *options])
+        return (status, *capsys.readouterr())
+
+    return study
+
+
+def test_a_study_keeps_each_run_and_does_none_twice(study: Study) -> None:
+    lines = (f"trials=3 {SMALL} seed=0  # a run", f"{SMALL} seed=0 method.audit=stop")
+    status, told, error = study(*lines)
+    assert (status, error) == (0, "")
+    assert "[2 of 2]" in told
+    rows = results.load(Path("kept")).rows.values()
+    assert {(row.trials, bool(row.failure)) for row in rows} == {(3, False), (0, True)}
+    assert study(*lines) == (0, "", "")
+    # A run whose line is lost is collected again. A run of other code, unfinished, begins again.
+    (Path("kept") / results.ROWS).unlink()
+    run = next(RunDirectory(path.parent) for path in Path("runs").rglob("score.json"))
+    run.score_file.unlink()
+    versions = run.versions()
+    run.versions_file.unlink()
+    write_json(run.versions_file, {**versions, "code": "other"})
+    status, told, error = study(*lines)
+    assert (status, error) == (0, "")
+    assert told.count("was there already") == 1
+    assert "begins again" in told
+    assert run.versions() == versions
+    assert len(results.load(Path("kept")).rows) == 2
+
+
+def test_a_mistake_in_a_study_is_told_before_anything_runs(study: Study) -> None:
+    status, told, error = study(SMALL, "task=rocket_navigation method=twostag")
+    assert (status, told) == (2, "")
+    assert error.startswith("study: study.txt, line 2: unknown method 'twostag'")
+    assert not Path("runs").exists()
+
+
+def test_a_study_names_what_is_left(study: Study) -> None:
+    status, told, _ = study(f"{SMALL} 'seed=range(0,2)'", options=("--list",))
+    assert status == 0
+    assert [line.split("seed=")[1].split()[0] for line in told.splitlines()] == ["0", "1"]
+
+
+@pytest.mark.parametrize("line", ["trials=x task=rocket_navigation", "'"])
+def test_a_line_that_cannot_be_read_is_named(study: Study, line: str) -> None:
+    status, _, error = study("", line)
+    assert status == 2
+    assert "study.txt, line 2: " in error

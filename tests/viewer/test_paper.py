@@ -1,0 +1,233 @@
+"""The paper's figures: their claims and figures follow from the data."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tsbench import tasks
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import Plan
+from tsbench.core.task import plannable
+from tsbench.runs import config, results
+from tsbench.runs.directory import Record, RunDirectory, Stage
+from tsbench.runs.execute import prepare
+from tsbench.runs.provenance import write_provenance
+from tsbench.runs.results import Curve, Result, Results
+from tsbench.viewer.paper import ladder, learning, maps, page, plans, scores
+from tsbench.viewer.paper.exhibit import COLOURS, MONOLITHIC, OURS, PRM, Claim, compare, grouped
+
+ROCKET = "rocket_navigation"
+Invented = Callable[[str], Record]
+
+
+@pytest.fixture(name="make")
+def make_fixture(invented_record: Invented) -> Callable[..., Result]:
+    """A function that makes the result of a seed, with so much reward and success."""
+    record = invented_record(ROCKET)
+
+    def make(
+        method: str, seed: int, reward: float, success: float = 1.0, *options: str,
+        distance: float = 60.0,
+    ) -> Result:  # fmt: skip
+        solved = round(100 * success)
+        perturbed = replace(
+            record.score.perturbed, normalized_reward=reward, solved_reward=reward,
+            success=solved / 100, solved=(1,) * solved + (0,) * (100 - solved),
+        )  # fmt: skip
+        score = replace(
+            record.score, perturbed=perturbed, normalized_reward=reward, solved_reward=reward,
+            success=solved / 100,
+        )  # fmt: skip
+        if distance != 60.0:
+            options = (*options, f"task.constants.distance={distance:g}")
+        words = (f"task={ROCKET}", f"method={method}", "budget=smoke", f"seed={seed}", *options)
+        return Result(
+            words=words, task=ROCKET, method=method, seed=seed, budget="smoke", distance=distance,
+            standard=distance == 60.0, commit=None, settings="", stages=record.stages, score=score,
+        )  # fmt: skip
+
+    return make
+
+
+def of(rows: Sequence[Result]) -> Results:
+    return Results({row.words: row for row in rows})
+
+
+def verdicts(claims: Sequence[Claim], says: str) -> list[bool | None]:
+    return [claim.holds for claim in claims if says in claim.says]
+
+
+def test_a_method_has_one_colour_and_its_variants_paler_ones(make: Callable[..., Result]) -> None:
+    rows = [
+        make("zigzag", 0, 0.1), make(MONOLITHIC, 0, 0.1), make(OURS, 0, 0.1), make(PRM, 0, 0.1),
+        make(PRM, 0, 0.1, 1.0, "method.roadmap=layered"), make(OURS, 0, 0.1, distance=24.0),
+    ]  # fmt: skip
+    groups = grouped(of(rows).groups())
+    labels = [group.label for group in groups]
+    assert labels == [OURS, OURS, PRM, f"{PRM}, roadmap=layered", MONOLITHIC, "zigzag"]
+    colours = [group.colour for group in groups]
+    assert colours[:3] == [COLOURS[OURS], COLOURS[OURS], COLOURS[PRM]]
+    assert len(set(colours)) == 5
+
+
+def test_an_order_holds_by_its_interval_and_not_by_its_mean(make: Callable[..., Result]) -> None:
+    def verdict(ours: Sequence[float], theirs: Sequence[float]) -> bool | None:
+        rows = [make(OURS, seed, reward) for seed, reward in enumerate(ours)]
+        rows += [make(MONOLITHIC, seed, reward) for seed, reward in enumerate(theirs)]
+        groups = grouped(of(rows).groups())
+        (claim,) = compare(groups, ROCKET, OURS, MONOLITHIC, "better")
+        return claim.holds
+
+    apart = [0.5 + 0.01 * seed for seed in range(10)]
+    assert verdict(apart, [0.1] * 10) is True
+    assert verdict([0.1] * 10, apart) is False
+    assert verdict([0.1, 0.9] * 5, [0.9, 0.1] * 5) is False
+    assert verdict(apart[:9], [0.1] * 9) is None  # too few seeds
+
+
+def test_the_table_by_hand(make: Callable[..., Result]) -> None:
+    rows = [make(OURS, seed, float(seed), seed / 10) for seed in range(11)]
+    rows += [make(MONOLITHIC, seed, 1.0, 0.0) for seed in (2, 4)]
+    failed = make(PRM, 2, 0.0)
+    rows.append(replace(failed, score=None, failure="no way"))
+    groups = grouped(of(rows).groups())
+    ours, prm, monolithic = scores.table(groups, {ROCKET: tasks.make(ROCKET)})
+    assert (ours.solved.iqm, ours.succeeding) == (5.0, 1)
+    assert ours.success == pytest.approx(0.5)
+    assert ours.solved.interval is not None
+    assert ours.against is None
+    assert monolithic.solved.interval is None
+    assert monolithic.against is not None
+    assert (monolithic.against.mean, monolithic.against.interval) == (1.0 - 3.0, None)
+    assert (prm.solved.iqm, prm.success, prm.succeeding) == (0.0, 0.0, 0)
+    assert scores.cells(monolithic)[2] == "2, too few"
+
+
+def test_curves_of_stages_follow_each_other_on_every_axis(make: Callable[..., Result]) -> None:
+    stages = (
+        Stage("plan", 100, steps=100, seconds=5.0),
+        Stage("imitate", 50, steps=50, physics_substeps=1000, seconds=20.0),
+    )
+    row = replace(make(OURS, 0, 0.5), stages=stages)
+    curves = tuple(
+        Curve(name, np.array([10.0, end]), np.array([1.0, 2.0]), np.array([0.1, 0.2]))
+        for name, end in (("plan", 100.0), ("imitate", 50.0))
+    )
+    found = {
+        axis.name: [x.tolist() for _, x, _ in learning.points(axis, curves, row)]
+        for axis in learning.AXES
+    }
+    assert found == {
+        "steps": [[10, 100], [110, 150]],
+        "substeps": [[0, 0], [200, 1000]],
+        "seconds": [[1, 2], [6, 7]],
+    }
+
+
+def test_how_smooth_a_plan_is_by_hand(make: Callable[..., Result]) -> None:
+    """Straight at an even pace, and with a corner in the middle."""
+    task = plannable(tasks.make(ROCKET))
+    (group,) = grouped(of([make(OURS, 0, 0.5)]).groups())
+    goal = np.array([*plannable(task).spec().site("goal").pos])[[0, 2]]
+
+    def way(*corners: np.ndarray) -> plans.Way:
+        at = np.linspace(0.0, len(corners) - 1.0, 100 * (len(corners) - 1) + 1)
+        columns = [np.interp(at, range(len(corners)), column) for column in np.transpose(corners)]
+        states = np.column_stack([*columns, np.zeros(len(at))])
+        plan = Plan(ROCKET, task.version, 0.05, states, np.zeros(len(at) - 1))
+        return plans.way(task, plan, group, 0)
+
+    straight = way(np.zeros(2), goal)
+    assert straight.length == pytest.approx(60.0, abs=1.0)
+    assert straight.roughness == pytest.approx(0.0, abs=1e-6)
+    assert straight.turning == pytest.approx(0.0, abs=1e-6)
+    corner = way(np.zeros(2), np.array([goal[0], 0.0]), goal)
+    assert corner.turning * corner.length == pytest.approx(math.pi / 2, abs=1e-6)
+    assert corner.roughness > 1.0
+
+
+def test_the_printed_imitation_reward_is_as_sparse_as_the_task_s(
+    make: Callable[..., Result], make_run: Callable[..., Path], naive_plan: Callable[[str], Plan]
+) -> None:
+    """It has R as a factor, so that it is not felt at the start of the plan."""
+    row, path = make(OURS, 0, 0.5), make_run(ROCKET)
+    found = replace(of([row]), folders={row.words: RunDirectory(path)})
+    (exhibit,) = maps.exhibits(found, grouped(found.groups()))
+    assert verdicts(exhibit.claims, "R is sparse") == [True]
+    dense = {claim.found.split(", ")[2].split(":")[0]: claim.holds for claim in exhibit.claims[1:]}
+    assert dense == {"progress": True, "paper": False}
+
+
+def test_a_ladder_says_where_a_method_fails(make: Callable[..., Result]) -> None:
+    rows = [
+        make(method, seed, 0.5, 1.0 if method == OURS else near, distance=distance)
+        for method in (OURS, MONOLITHIC)
+        for distance, near in ((24.0, 1.0), (60.0, 0.0))
+        for seed in range(3)
+    ]
+    (exhibit,) = ladder.exhibits(grouped(of(rows).groups()))
+    assert verdicts(exhibit.claims, "Two stages solve") == [True]
+    assert verdicts(exhibit.claims, "monolithic") == [False]
+    assert "1.00 at 24 m, 0.00 at 60 m" in exhibit.claims[0].found
+    assert len(exhibit.rows) == 12
+    standard = [row for row in rows if row.standard]
+    assert not list(ladder.exhibits(grouped(of(standard).groups())))
+
+
+def test_a_folder_of_figures_is_complete_and_needs_nothing_else(
+    tmp_path: Path, make: Callable[..., Result], make_run: Callable[..., Path]
+) -> None:
+    rows = [make(method, seed, 0.1) for method in (OURS, MONOLITHIC) for seed in range(3)]
+    rows.append(make(PRM, 0, 0.1, 1.0, "task.constants.start_spread=3"))
+    rows[-1] = replace(rows[-1], standard=False)
+    found = of(rows)
+    found.folders[rows[0].words] = RunDirectory(make_run(ROCKET))
+    points = np.linspace(0.1, 1.0, 5)
+    found.curves[rows[0].words] = (Curve("plan", 1000 * points, points, points),)
+    out = tmp_path / "figures"
+    lines, remarks = page.write(found, out)
+    assert len(lines) == 2
+    assert any("left out, since its constants were changed" in remark for remark in remarks)
+    names = {
+        "scores", f"heatmap_{ROCKET}", "learning_steps", "learning_substeps", "learning_seconds",
+        f"plans_{ROCKET}", f"survival_{ROCKET}",
+    }  # fmt: skip
+    assert {path.stem for path in out.glob("*.png")} == names
+    for kind in ("svg", "csv"):
+        assert names <= {path.stem for path in out.glob(f"*.{kind}")}
+    text = (out / "index.html").read_text("utf-8")
+    assert text.count('src="data:image/png;base64,') == len(names)
+    assert not re.search(r"https?://|@import", re.sub(r'src="[^"]*"', "", text))
+    assert "what came out" in text
+    with pytest.raises(TsbenchError, match="nothing is overwritten: give another by --out DIR"):
+        page.write(found, out)
+
+
+def test_the_commands_keep_a_run_and_draw_it_with_a_strip(
+    tmp_path: Path, make_run: Callable[..., Path]
+) -> None:
+    path, words = make_run("laikago_trot"), ["task=laikago_trot", "budget=smoke"]
+    chosen = config.compose(words)
+    write_provenance(RunDirectory(path), chosen, prepare(chosen), words)
+    for command in (
+        ["collect", str(path), "--out", str(tmp_path / "kept"), "--trials", "6"],
+        ["figures", str(tmp_path / "kept"), "--out", str(tmp_path / "out")],
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "tsbench", *command], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+    assert "laikago_trot" in done.stdout
+    (row,) = results.load(tmp_path / "kept").rows.values()
+    assert row.trials == 6
+    for name in ("strip_laikago_trot.png", "plans_laikago_trot.svg", "table.md", "index.html"):
+        assert (tmp_path / "out" / name).exists(), name

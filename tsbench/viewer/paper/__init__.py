@@ -1,0 +1,1 @@
+"""The paper's figures, made of results: each with what the paper says and what came out."""

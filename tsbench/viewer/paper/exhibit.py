@@ -1,0 +1,247 @@
+"""What all of the paper's figures share: their parts, colours, labels and sizes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from tsbench.core.words import several
+from tsbench.evaluation.statistics import Difference, paired_difference
+from tsbench.runs.results import Result
+
+# The paper's methods, by the names that they have here.
+OURS, MONOLITHIC, PRM, PRM_RL = "twostage", "monolithic", "prm", "prm_rl"
+
+# Colours of Okabe and Ito's palette, which colour-blind readers can tell apart. A method has the
+# same one in every figure; one that is not of the paper has a spare one.
+COLOURS = {OURS: "#d55e00", PRM: "#009e73", PRM_RL: "#cc79a7", MONOLITHIC: "#0072b2"}
+SPARE = ("#e69f00", "#56b4e9", "#000000")
+
+WIDTH = 6.4  # inches; a picture as wide as a phone still shows its text
+DPI = 150
+SHARES = "cividis"  # colours of shares and rewards, the same to colour-blind readers
+STYLE = {
+    "font.family": "sans-serif",
+    "font.size": 11.0,
+    "axes.titlesize": 11.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": False,
+    "legend.frameon": False,
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "tsbench",
+}
+VERDICTS = {True: "as the paper says", False: "differs", None: "cannot be told yet"}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Attributes:
+    says: what the paper says.
+    found: what came out.
+    holds: whether they agree; None where the results are too few to tell.
+    """
+
+    says: str
+    found: str
+    holds: bool | None
+
+    @property
+    def verdict(self) -> str:
+        return VERDICTS[self.holds]
+
+
+@dataclass(frozen=True, eq=False)
+class Exhibit:
+    """A figure of the paper.
+
+    Attributes:
+        name: of its files.
+        title: what it shows, in a few words.
+        note: how to read it.
+        figure: the picture.
+        claims: what the paper says of it, and what came out.
+        columns: names of the columns of its data.
+        rows: its data.
+    """
+
+    name: str
+    title: str
+    note: str
+    figure: Figure
+    claims: Sequence[Claim]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Runs that differ in their seed alone.
+
+    Attributes:
+        rows: by seed.
+        label: names the group among those of its task.
+        colour: of its method; paler or darker for further variants of the method.
+    """
+
+    rows: tuple[Result, ...]
+    label: str
+    colour: str
+
+    @property
+    def first(self) -> Result:
+        return self.rows[0]
+
+    @property
+    def method(self) -> str:
+        return self.first.method
+
+    @property
+    def task(self) -> str:
+        return self.first.task
+
+    def values(self, name: str) -> dict[int, float]:
+        """An attribute of each result, by seed."""
+        return {row.seed: float(getattr(row, name)) for row in self.rows}
+
+
+def grouped(groups: Sequence[Sequence[Result]]) -> list[Group]:
+    """The groups with labels and colours: the paper's methods first, then the others by name."""
+    order = {method: rank for rank, method in enumerate(COLOURS)}
+    ranked = sorted(groups, key=lambda rows: (order.get(rows[0].method, len(order)), rows[0].kind))
+    others = sorted({rows[0].method for rows in groups} - COLOURS.keys())
+    colours = COLOURS | {name: SPARE[i % len(SPARE)] for i, name in enumerate(others)}
+    seen: dict[tuple[str, str, float], int] = {}
+    found = []
+    for rows in ranked:
+        one = rows[0]
+        place = (one.task, one.method, one.distance)
+        variant = seen[place] = seen.get(place, -1) + 1
+        label = _label(one)
+        if one.budget != _main_budget(groups, one):
+            label += f", budget {one.budget}"
+        found.append(Group(tuple(rows), label, _shade(colours[one.method], variant)))
+    return found
+
+
+def _main_budget(groups: Sequence[Sequence[Result]], one: Result) -> str:
+    """Of the budgets of a task, method and options the one with the most runs."""
+    counts: Counter[str] = Counter()
+    for rows in groups:
+        other = rows[0]
+        if (other.task, other.method, other.options) == (one.task, one.method, one.options):
+            counts[other.budget] += len(rows)
+    return counts.most_common(1)[0][0]
+
+
+def _label(result: Result) -> str:
+    """The method with its options; that it has settings of its own is all that is said of them."""
+    options = [
+        word.removeprefix("method.") for word in result.options if not word.startswith("task.")
+    ]
+    others = any(word.startswith("task.") for word in result.options)
+    tuned = ["tuned" if result.trials else "other settings"] if others else []
+    return ", ".join([result.method, *options, *tuned])
+
+
+def _shade(colour: str, variant: int) -> str:
+    """The colour, then paler, darker, still paler, still darker ones."""
+    share = 0.6 ** ((variant + 1) // 2)
+    ground = variant % 2  # white or black
+    mixed: str = to_hex([ground + share * (part - ground) for part in to_rgb(colour)])
+    return mixed
+
+
+@contextmanager
+def drawing(height: float) -> Iterator[Figure]:
+    """A new figure of the standard width and a height in inches, in the figures' style."""
+    with matplotlib.rc_context(STYLE):
+        yield Figure(figsize=(WIDTH, height), layout="constrained")
+
+
+def legend(figure: Figure, groups: Sequence[Group], extra: Sequence[Line2D] = ()) -> None:
+    """One line for each label, above the panels."""
+    lines = {group.label: Line2D([], [], color=group.colour, linewidth=3) for group in groups}
+    handles, labels = [*lines.values(), *extra], [*lines, *(str(e.get_label()) for e in extra)]
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=min(len(handles), 3), fontsize=10,
+        handlelength=1.5, columnspacing=1.2,
+    )  # fmt: skip
+
+
+def jitter(count: int, width: float) -> np.ndarray:
+    """Offsets that keep dots at one place apart, evenly within the width, shape (count,)."""
+    return (np.arange(count) - (count - 1) / 2) * width / max(count - 1, 1)
+
+
+def difference(first: Group, second: Group, name: str) -> Difference | None:
+    """What the first group has more than the second of an attribute of results, over the seeds that
+    both have; None without such seeds."""
+    one, other = first.values(name), second.values(name)
+    seeds = one.keys() & other.keys()
+    if not seeds:
+        return None
+    return paired_difference({"": {s: one[s] for s in seeds}}, {"": {s: other[s] for s in seeds}})
+
+
+def interval(found: tuple[float, float] | None) -> str:
+    return "" if found is None else f" [{found[0]:.3f}, {found[1]:.3f}]"
+
+
+def compare(
+    groups: Sequence[Group], task: str, better: str, worse: str, says: str, *, ties: bool = False
+) -> Iterator[Claim]:
+    """The paper's order of two methods on a task, beside what came out of it.
+
+    The order holds where the 95 % interval of the paired difference of `normalized_reward` lies
+    above zero, or with `ties` not below it, and cannot be told without an interval.
+    """
+    first, second = (main_group(groups, task, name) for name in (better, worse))
+    if first is None or second is None:
+        return
+    found = difference(first, second, "normalized_reward")
+    means = " and ".join(
+        f"{group.label} {np.mean(list(group.values('normalized_reward').values())):.3f} "
+        f"({several(len(group.rows), 'seed')})"
+        for group in (first, second)
+    )
+    text = f"{task}: normalized reward {means}"
+    if found is None:
+        yield Claim(says, f"{text}; no seed in common", None)
+        return
+    text += f"; difference {found.mean:.3f}{interval(found.interval)}"
+    holds = None
+    if found.interval is not None:
+        holds = found.interval[1] >= 0.0 if ties else found.interval[0] > 0.0
+    else:
+        text += ", too few seeds for an interval"
+    yield Claim(says, text, holds)
+
+
+def main_group(groups: Sequence[Group], task: str, method: str) -> Group | None:
+    """The method's group on a task, of several the one with the most seeds."""
+    found = [group for group in groups if (group.task, group.method) == (task, method)]
+    return max(found, key=lambda group: len(group.rows)) if found else None
+
+
+def by_task(groups: Sequence[Group]) -> Mapping[str, list[Group]]:
+    """The groups of each task, the tasks in the order of their names."""
+    found: dict[str, list[Group]] = {}
+    for group in sorted(groups, key=lambda group: group.task):
+        found.setdefault(group.task, []).append(group)
+    return found
+
+
+def tidy(panel: Axes) -> None:
+    panel.grid(alpha=0.3)
+    panel.margins(x=0.02)

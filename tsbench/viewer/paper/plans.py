@@ -1,0 +1,224 @@
+"""Plans of the methods that plan, and how smooth they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tsbench.core.motion import Plan
+from tsbench.core.task import Plannable, Task
+from tsbench.core.words import several
+from tsbench.runs.results import Results
+from tsbench.viewer.paper.exhibit import (
+    OURS,
+    PRM,
+    Claim,
+    Exhibit,
+    Group,
+    by_task,
+    drawing,
+    tidy,
+)
+from tsbench.viewer.recording import record_motion
+from tsbench.viewer.scene import Array
+from tsbench.viewer.show import Actor, track
+
+ARRIVED = 0.05  # m, nearer than this to where a plan comes nearest to its goal it has arrived
+
+
+@dataclass(frozen=True)
+class Way:
+    """A plan in figures.
+
+    Attributes:
+        group: of the run that it is of.
+        seed: of that run.
+        plan: itself.
+        path: positions of the robot's base, world frame in metres, shape (n, 3).
+        length: metres until it arrives.
+        seconds: until it arrives.
+        roughness: root of the mean squared acceleration of the base until it arrives, m/s^2.
+        turning: by how much its direction turns in a metre, in radians.
+    """
+
+    group: Group
+    seed: int
+    plan: Plan
+    path: Array
+    length: float
+    seconds: float
+    roughness: float
+    turning: float
+
+
+def exhibits(
+    results: Results, groups: Sequence[Group], tasks: dict[str, Task]
+) -> Iterator[Exhibit]:
+    """One for each task of which there are plans at hand."""
+    for name, members in by_task(groups).items():
+        task = tasks[name]
+        if not isinstance(task, Plannable):
+            continue
+        ways: dict[Group, list[Way]] = {}
+        for group in members:
+            for row in group.rows:
+                run = results.folders.get(row.words)
+                plan = run.plan(task) if run else None
+                if plan is not None:
+                    ways.setdefault(group, []).append(way(task, plan, group, row.seed))
+        if ways:
+            yield _exhibit(task, ways)
+
+
+def way(task: Plannable[Any], plan: Plan, group: Group, seed: int) -> Way:
+    model = task.spec().compile()
+    poses = task.abstraction().poses(plan.states)
+    body = model.body(task.pushed).id
+    path = track(model, Actor("plan", poses, plan.timestep, (0, 0, 0), "")).positions[:, body]
+    away = np.linalg.norm(path - model.site("goal").pos, axis=-1)
+    flight = path[: max(int(np.argmax(away < away.min() + ARRIVED)), 2) + 1]
+    moves = np.linalg.norm(np.diff(flight, axis=0), axis=-1)
+    acceleration = np.diff(flight, n=2, axis=0) / plan.timestep**2
+    steps = np.diff(flight, axis=0)[moves > 1e-9]
+    unit = steps / np.linalg.norm(steps, axis=-1, keepdims=True)
+    cosine = np.clip(np.sum(unit[1:] * unit[:-1], axis=-1), -1.0, 1.0)
+    length = float(moves.sum())
+    return Way(
+        group=group,
+        seed=seed,
+        plan=plan,
+        path=path,
+        length=length,
+        seconds=(len(flight) - 1) * plan.timestep,
+        roughness=float(np.sqrt(np.mean(np.sum(acceleration**2, axis=-1)))),
+        turning=float(np.arccos(cosine).sum() / max(length, 1e-9)),
+    )
+
+
+def _exhibit(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Exhibit:
+    drawn = task.drawing()
+    planar = drawn.bounds is not None
+    height = 0.4 + len(ways) * (3.4 if planar else 2.1)
+    with drawing(height) as figure:
+        panels = figure.subplots(len(ways), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+        for panel, (group, members) in zip(panels, ways.items(), strict=True):
+            roughness = np.mean([one.roughness for one in members])
+            turning = np.mean([one.turning for one in members])
+            panel.set_title(
+                f"{group.label}: {roughness:.1f} m/s\u00b2, {turning:.2f} rad/m",
+                loc="left", color=group.colour,
+            )  # fmt: skip
+            if planar:
+                _draw_paths(panel, task, members)
+            else:
+                _draw_feet(panel, task, members[0])
+            tidy(panel)
+        panels[-1].set_xlabel("x, m" if planar else "time, s")
+    what = (
+        "The plans of the seeds at hand."
+        if planar
+        else "Where each foot of the first seed's plan is along the way: level while it stands."
+    )
+    return Exhibit(
+        name=f"plans_{task.name}",
+        title=f"Planned motions of {task.name}",
+        note=f"{what} Smoothness of the base's path until it arrives, mean over seeds: the root of "
+        "the mean squared acceleration, and by how much the direction turns in a metre.",
+        figure=figure,
+        claims=tuple(_claims(task, ways)),
+        columns=(
+            "task", "method", "seed", "length_m", "seconds", "roughness_m_per_s2",
+            "turning_rad_per_m",
+        ),
+        rows=[
+            (task.name, group.label, one.seed, round(one.length, 3), round(one.seconds, 3),
+             round(one.roughness, 4), round(one.turning, 5))
+            for group, members in ways.items()
+            for one in members
+        ],
+    )  # fmt: skip
+
+
+def _draw_paths(panel: Any, task: Plannable[Any], members: Sequence[Way]) -> None:
+    model = task.spec().compile()
+    for one in members:
+        panel.plot(one.path[:, 0], one.path[:, 2], color=one.group.colour, lw=1.3, alpha=0.8)
+    for index in range(model.ngeom):
+        name = model.geom(index).name
+        if name.startswith("obstacle"):
+            x, _, z = model.geom_pos[index]
+            panel.plot(x, z, "s", color="black", ms=6)
+    x, _, z = model.site("goal").pos
+    panel.plot(x, z, "*", color="black", ms=11, clip_on=False)
+    panel.set(aspect="equal", ylabel="z, m")
+
+
+def _draw_feet(panel: Any, task: Plannable[Any], one: Way) -> None:
+    names = task.abstraction().coordinates
+    shades = ("-", "--", "-.", ":")
+    for foot, dashes in zip(task.drawing().feet, shades, strict=False):
+        if f"{foot}_x" in names:
+            column = one.plan.states[:, names.index(f"{foot}_x")]
+            panel.plot(
+                one.plan.times, column, dashes, color=one.group.colour, lw=1.2,
+                label=foot.removesuffix("_foot"),
+            )  # fmt: skip
+    panel.set(ylabel="x of each foot, m")
+    panel.legend(ncols=4, loc="upper left", fontsize=9)
+
+
+def _claims(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Claim]:
+    """Of a planar task how smooth its plans are, of one with feet how regular its footsteps."""
+    if task.drawing().bounds is None:
+        yield from _regular(task, ways)
+    else:
+        yield from _smoother(task.name, ways)
+
+
+def _regular(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Claim]:
+    """By the task's leading measure and by the audit, of the first plan of each group."""
+    measure = next(iter(task.measure_notes))
+    values: dict[Group, float] = {}
+    failures: dict[Group, str] = {}
+    for group, members in ways.items():
+        reference = task.reference(members[0].plan)
+        values[group] = record_motion(task, reference).measures[measure] or 0.0
+        failed = task.audit(members[0].plan, reference).failures
+        failures[group] = ", ".join(item.what for item in failed)
+    ours = next((value for group, value in values.items() if group.method == OURS), None)
+    for group, value in values.items():
+        if group.method == PRM and ours is not None:
+            audit = (
+                f"fails its audit ({failures[group]})" if failures[group] else "passes its audit"
+            )
+            yield Claim(
+                "PRM's plans have irregular footsteps.",
+                f"{task.name}: the plan of {group.label} {audit}; {measure} {value:.2f}, of the "
+                f"learned plan {ours:.2f}",
+                bool(failures[group]) or value < ours,
+            )
+
+
+def _smoother(task: str, ways: dict[Group, list[Way]]) -> Iterator[Claim]:
+    plans = {
+        method: [one for group in ways for one in ways[group] if group.method == method]
+        for method in (OURS, PRM)
+    }
+    if not all(plans.values()):
+        return
+    told, smoother = [], []
+    for name, unit in (("roughness", "m/s\u00b2"), ("turning", "rad/m")):
+        ours, theirs = (
+            float(np.mean([getattr(one, name) for one in members])) for members in plans.values()
+        )
+        told.append(f"{name} {ours:.2f} and {theirs:.2f} {unit}")
+        smoother.append(ours < theirs)
+    yield Claim(
+        "The learned plan is smoother than PRM's.",
+        f"{task}: {' and '.join(told)}, of {several(len(plans[OURS]), 'plan')} of {OURS} "
+        f"and {len(plans[PRM])} of {PRM}",
+        smoother[0] if len(set(smoother)) == 1 else None,
+    )

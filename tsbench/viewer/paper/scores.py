@@ -1,0 +1,169 @@
+"""The table of scores: every task and method, over the training seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tsbench.core.task import Task
+from tsbench.core.words import number
+from tsbench.evaluation.statistics import Aggregate, Difference, aggregate, holm
+from tsbench.viewer.paper.exhibit import (
+    OURS,
+    Exhibit,
+    Group,
+    by_task,
+    difference,
+    drawing,
+    interval,
+    jitter,
+    main_group,
+    tidy,
+)
+from tsbench.viewer.paper.learning import ENOUGH
+
+LEADING = 2  # of a task's measures, what matters most
+
+
+@dataclass(frozen=True)
+class Line:
+    """A row of the table.
+
+    Attributes:
+        group: what it is of.
+        solved: `solved_reward` over the seeds.
+        normalized: `normalized_reward` over the seeds.
+        success: mean share of the perturbed starts solved.
+        succeeding: seeds that solve at least `ENOUGH` of them.
+        measures: means of the task's leading measures, over the seeds that have them.
+        against: `normalized_reward` less that of the two-stage method with the same seeds.
+        p_value: of that, after Holm over the table; None without one.
+    """
+
+    group: Group
+    solved: Aggregate
+    normalized: Aggregate
+    success: float
+    succeeding: int
+    measures: dict[str, float | None]
+    against: Difference | None
+    p_value: float | None
+
+
+def table(groups: Sequence[Group], tasks: dict[str, Task]) -> list[Line]:
+    """The rows, by task."""
+    ordered = [group for members in by_task(groups).values() for group in members]
+    against: dict[Group, Difference] = {}
+    for group in ordered:
+        ours = main_group(groups, group.task, OURS)
+        if ours is not None and group is not ours:
+            found = difference(group, ours, "normalized_reward")
+            if found is not None:
+                against[group] = found
+    corrected = holm({str(i): one.p_value for i, one in enumerate(against.values())})
+    p_values = dict(zip(against, corrected.values(), strict=True))
+    return [_line(group, tasks, against.get(group), p_values.get(group)) for group in ordered]
+
+
+def _line(
+    group: Group, tasks: dict[str, Task], against: Difference | None, p_value: float | None
+) -> Line:
+    measures = {}
+    for name in list(tasks[group.task].measure_notes)[:LEADING]:
+        values = [
+            value
+            for row in group.rows
+            if row.score and (value := row.score.perturbed.measures.get(name)) is not None
+        ]
+        measures[name] = float(np.mean(values)) if values else None
+    successes = list(group.values("success").values())
+    return Line(
+        group=group,
+        solved=aggregate({"": group.values("solved_reward")}),
+        normalized=aggregate({"": group.values("normalized_reward")}),
+        success=float(np.mean(successes)),
+        succeeding=sum(share >= ENOUGH for share in successes),
+        measures=measures,
+        against=against,
+        p_value=p_value,
+    )
+
+
+COLUMNS = (
+    "task", "method", "seeds", "solved_reward", "normalized_reward", "success",
+    "seeds that succeed", f"less {OURS}", "p (Holm)", "trials", "measures",
+)  # fmt: skip
+
+
+def cells(line: Line) -> tuple[str, ...]:
+    """A row as text, in the order of `COLUMNS`."""
+    count = len(line.group.rows)
+    against, p_value = "", ""
+    if line.against is not None:
+        against = f"{line.against.mean:+.3f}{interval(line.against.interval)}"
+        if line.against.interval is not None and line.p_value is not None:
+            p_value = f"{line.p_value:.3g}"
+    return (
+        line.group.task,
+        line.group.label,
+        str(count) if line.solved.standing == "ranked" else f"{count}, {line.solved.standing}",
+        f"{line.solved.iqm:.3f}{interval(line.solved.interval)}",
+        f"{line.normalized.iqm:.3f}{interval(line.normalized.interval)}",
+        f"{line.success:.2f}",
+        f"{line.succeeding} of {count}",
+        against,
+        p_value,
+        str(max(row.trials for row in line.group.rows)),
+        "; ".join(f"{name} {number(value)}" for name, value in line.measures.items()),
+    )
+
+
+def exhibit(groups: Sequence[Group], tasks: dict[str, Task]) -> tuple[Exhibit, list[Line]]:
+    """The scores as dots and intervals, and the table."""
+    lines = table(groups, tasks)
+    parts = by_task([line.group for line in lines])
+    sizes = [len(members) for members in parts.values()]
+    with drawing(0.5 + sum(0.75 + 0.34 * size for size in sizes)) as figure:
+        panels = figure.subplots(
+            len(parts), 1, squeeze=False, gridspec_kw={"height_ratios": [s + 0.5 for s in sizes]}
+        )[:, 0]
+        for panel, (task, members) in zip(panels, parts.items(), strict=True):
+            for place, group in enumerate(members):
+                line = next(one for one in lines if one.group is group)
+                scores = list(group.values("solved_reward").values())
+                heights = place + jitter(len(scores), 0.45)
+                panel.plot(scores, heights, "o", color=group.colour, ms=5, alpha=0.6, mec="white")
+                if line.solved.interval is not None:
+                    panel.plot(line.solved.interval, [place] * 2, color=group.colour, lw=4)
+                    panel.plot(line.solved.iqm, place, "D", color=group.colour, mec="black", ms=7)
+            panel.set_title(task, loc="left")
+            panel.set_yticks(range(len(members)), [group.label for group in members])
+            panel.set_ylim(len(members) - 0.5, -0.5)
+            panel.set_xlim(left=min(0.0, panel.get_xlim()[0]))
+            tidy(panel)
+        panels[-1].set_xlabel("solved_reward")
+    rows = [
+        (
+            row.task, group.label, row.seed, row.solved_reward, row.normalized_reward, row.success,
+            row.steps, round(sum(stage.seconds for stage in row.stages), 1), row.trials,
+            row.failure, row.command, row.commit,
+        )
+        for group in (line.group for line in lines)
+        for row in group.rows
+    ]  # fmt: skip
+    shown = Exhibit(
+        name="scores",
+        title="Scores of every task and method",
+        note="A dot is a training seed, a diamond the interquartile mean over at least ten seeds, "
+        "with its 95 % bootstrap interval. A seed whose plan fails its audit scores zero.",
+        figure=figure,
+        claims=(),
+        columns=(
+            "task", "method", "seed", "solved_reward", "normalized_reward", "success", "steps",
+            "seconds", "trials", "failure", "command", "commit",
+        ),
+        rows=rows,
+    )  # fmt: skip
+    return shown, lines
