@@ -279,18 +279,16 @@ class Laikago(Plannable[LaikagoState]):
         gained = xp.clip(course.nearest - distance, 0.0, None)
         scheduled = self.gait.contacts(state.time)
         down = state.feet[..., 2] - C.foot_radius < C.sole_height
-
-        def share(feet: Array) -> Array:
-            """Share of all feet, weighted by the ground that the step gained."""
-            return gained * xp.mean(xp.astype(feet, gained.dtype), axis=-1)
-
+        # Shares of all feet: multiples of a quarter, so that sums and differences are exact.
+        marks = xp.stack([scheduled, down, scheduled & down])
+        stand, touch, both = xp.mean(xp.astype(marks, gained.dtype), axis=-1)
         return LaikagoCourse(
             violated=course.violated | self.violated(state),
             nearest=xp.minimum(course.nearest, distance),
-            stance=course.stance + share(scheduled),
-            stance_kept=course.stance_kept + share(scheduled & down),
-            swing=course.swing + share(~scheduled),
-            swing_kept=course.swing_kept + share(~scheduled & ~down),
+            stance=course.stance + gained * stand,
+            stance_kept=course.stance_kept + gained * both,
+            swing=course.swing + gained * (1.0 - stand),
+            swing_kept=course.swing_kept + gained * (1.0 - (stand + touch - both)),
         )
 
     def footfall(self, course: Course) -> Array:
