@@ -28,6 +28,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "methods": {"core", "sim", "planning", "rl"},
     "evaluation": {"core", "sim", "tasks"},
     "runs": {"core", "sim", "tasks", "rl", "methods", "evaluation"},
+    "leaderboard": {"core", "sim", "tasks", "evaluation", "runs"},
     "viewer": {"core", "sim", "tasks", "evaluation", "runs"},
     "bench": {"core", "sim", "tasks", "rl", "methods", "evaluation", "runs"},
 }
@@ -51,6 +52,7 @@ ONLY_IN: dict[str, set[str]] = {
     "optuna": {"runs.tune"},
     "hydra": {"runs.config", "cli.launch"},
     "omegaconf": {"runs.config", "cli.launch"},
+    "jinja2": {"leaderboard"},
     "meshcat": {"viewer"},
     "matplotlib": {"viewer"},
     "pytest": {"testing"},

@@ -123,8 +123,8 @@ def refused(kind: type[Plan] | type[ReferenceMotion], path: Path, *words: str) -
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
-    refused(Plan, tmp_path / "plan.npz", "no plan at")
-    refused(ReferenceMotion, tmp_path / "nowhere" / "reference.npz", "no reference motion at")
+    refused(Plan, tmp_path / "plan.npz", "no plan ")
+    refused(ReferenceMotion, tmp_path / "nowhere" / "reference.npz", "no reference motion ")
     refused(Plan, tmp_path)  # a directory
 
 

@@ -185,7 +185,7 @@ def test_a_missing_file(saved: Path, name: str) -> None:
     (saved / name).unlink()
     refused(saved, "no policy file", name)
     (saved / name).mkdir()
-    refused(saved, "cannot read", name)
+    refused(saved, "not a regular file", name)
 
 
 def test_files_that_do_not_belong_together(saved: Path, tmp_path_factory: Any) -> None:
@@ -211,12 +211,17 @@ def test_any_damage_to_the_weights(saved: Path) -> None:
     "content",
     [
         b"", b"{", b"[]", b"3", b"null", b'"policy"', b"\xff\xfe\x00", b"{}", b"{\"layers\": [1]}",
-        b"[" * 100_000, b"NaN",
+        b"[" * 10_000, b"NaN",
     ],
 )  # fmt: skip
 def test_what_is_no_description(saved: Path, content: bytes) -> None:
     (saved / "policy.json").write_bytes(content)
     refused(saved, "damaged policy file", "policy.json")
+
+
+def test_a_huge_description(saved: Path) -> None:
+    (saved / "policy.json").write_bytes(b" " * 20_000)
+    refused(saved, "larger than the 16,384 bytes", "policy.json")
 
 
 def test_a_truncated_description(saved: Path) -> None:
@@ -246,7 +251,10 @@ def test_a_truncated_description(saved: Path) -> None:
         ({"layers": [5.5, 2]}, ["layers"]),
         ({"layers": "52"}, ["layers"]),
         ({"layers": [[5], 2]}, ["layers"]),
-        ({"layers": [float("inf"), 2]}, ["layers"]),
+        ({"layers": [float("inf"), 2]}, ["no finite number"]),
+        ({"layers": [5] * 18}, ["layers", "16 layers at most"]),
+        ({"output": "softmax"}, ["unknown output"]),
+        ({"bound": 0.0}, ["bound must be positive"]),
         ({"layers": None}, ["layers"]),
         ({"task": 5}, ["task"]),
         ({"task": None}, ["task"]),

@@ -11,6 +11,7 @@ from tsbench import tasks
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.evaluation.replay import compare, replay
+from tsbench.leaderboard import submission
 from tsbench.runs.directory import RunDirectory
 
 BOARDS = Path(__file__).parents[2] / "leaderboards"
@@ -26,8 +27,8 @@ def test_entries_are_of_tasks() -> None:
 @pytest.mark.parametrize("entry", ENTRIES, ids=NAMES)
 def test_an_entry_holds_together(entry: Path) -> None:
     run = RunDirectory(entry)
-    needed = {*run.essential, run.actions_file}
-    assert needed <= set(entry.iterdir()) <= {*needed, *run.optional}
+    assert submission.NEEDED.keys() <= {path.name for path in entry.iterdir()}
+    assert {path.name for path in entry.iterdir()} <= submission.LIMITS.keys()
     policy = run.policy()
     task = run.task(policy.info.task)
     check_fit(policy, task)
@@ -54,7 +55,7 @@ def test_an_entry_repeats(entry: Path) -> None:
     policy = RunDirectory(entry).policy()
     task = RunDirectory(entry).task(policy.info.task)
     score = RunDirectory(entry).record().score
-    log = RunDirectory(entry).actions()
+    log = RunDirectory(entry).actions(task)
     assert log is not None
     again = evaluate(policy, task, protocol=PROTOCOLS["smoke"], threads=1)
     then, now = score.origin, again.origin

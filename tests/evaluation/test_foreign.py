@@ -140,6 +140,25 @@ def test_onnx(rows: Any, tmp_path: Path) -> None:
     assert len(policy.sha256 or "") == 64
 
 
+def test_an_onnx_file_whose_weights_lie_elsewhere_is_refused(tmp_path: Path) -> None:
+    """onnxruntime would take them from the current directory."""
+    model = onnx.load(write_onnx(tmp_path / "p.onnx"))
+    onnx.save(
+        model, str(tmp_path / "q.onnx"), save_as_external_data=True, size_threshold=0,
+        location="weights",
+    )  # fmt: skip
+    with pytest.raises(TsbenchError, match="keeps weights in another file"):
+        foreign.load(tmp_path / "q.onnx", TASK)
+
+
+def test_an_onnx_file_with_random_numbers_is_refused(tmp_path: Path) -> None:
+    model = onnx.load(write_onnx(tmp_path / "p.onnx"))
+    model.graph.node.append(helper.make_node("RandomNormalLike", ["y"], ["noise"]))
+    onnx.save(model, str(tmp_path / "q.onnx"))
+    with pytest.raises(TsbenchError, match="the operator RandomNormalLike"):
+        foreign.load(tmp_path / "q.onnx", TASK)
+
+
 def test_onnx_files_that_do_not_fit(tmp_path: Path) -> None:
     with pytest.raises(TsbenchError, match=r"not one input of floats \(n, 10\) for rocket_nav"):
         foreign.load(write_onnx(tmp_path / "p.onnx", inputs=11), TASK)

@@ -202,22 +202,30 @@ def test_another_kind_of_machine(score: Score, log: ActionLog, group: str, name:
     """The physics is replayed from the actions, the rest may differ a little."""
     there = elsewhere(score, **{group: getattr(score.origin, group) | {name: "other"}})
     reward = score.perturbed.normalized_reward
-    near = with_perturbed(there, normalized_reward=reward + 0.9 * PROTOCOL.tolerance * BEST)
-    impulse = score.robustness.survival_impulse_50
-    kept = replace(near, robustness=replace(score.robustness, survival_impulse_50=1.05 * impulse))
-    found = compare(kept, score, TASK, log)
+    higher = reward + 0.9 * PROTOCOL.tolerance * BEST
+    near = with_perturbed(there, normalized_reward=higher)
+    assert "against_plan does not follow" in compare(near, score, TASK, log).words
+    found = compare(replace(near, against_plan=higher / BEST), score, TASK, log)
     assert (found.kind, found.agrees) == ("tolerant", True)
     assert f"({name} other there, {getattr(score.origin, group)[name]} here)" in found.words
     assert "within 0.05" in found.words
     assert "in agreement" in found.words
     assert found.words.endswith("replayed from the action log: equal")
 
+    impulse = score.robustness.survival_impulse_50
+    other = replace(score, robustness=replace(score.robustness, survival_impulse_50=1.05 * impulse))
+    assert differences(other, score, BEST) == []
+    assert (
+        "survival_impulse_50 is not that of the surface"
+        in compare(replace(other, origin=there.origin), score, TASK, log).words
+    )
+
     far = with_perturbed(there, normalized_reward=reward + 1.1 * PROTOCOL.tolerance * BEST)
     further = 3.0 + 2.0 * impulse
     kept = replace(far, robustness=replace(score.robustness, survival_impulse_50=further))
     found = compare(kept, score, TASK, log)
     assert (found.kind, found.agrees) == ("tolerant", False)
-    assert "DIFFERENT: perturbed.normalized_reward" in found.words
+    assert "perturbed.normalized_reward" in found.words
     assert "robustness.survival_impulse_50" in found.words
 
     assert "no action log" in compare(kept, score, TASK, None).words

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from tsbench.core.files import PART, write_whole
+from tsbench.core.files import write_whole
 from tsbench.runs.checkpoint import Checkpoints, decode, encode
 
 DTYPES = ("float32", "float64", "int64", "uint8", "bool")
@@ -138,4 +138,3 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
     assert caught.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["kept.json"]
-    assert not path.with_name(path.name + PART).exists()

@@ -250,10 +250,12 @@ def test_a_torn_checkpoint_is_told_and_the_one_before_is_used(
 
 
 def test_nothing_is_left_of_what_was_half_written(unfinished: Path) -> None:
-    for name in ("policy.json.part", "checkpoints/00-plan.part"):
+    """And a file of the user's with a similar name stays."""
+    ours = ".policy.json." + "0" * 32 + ".part"
+    for name in (ours, f"checkpoints/{ours}", "movie.part"):
         (unfinished / name).write_text("half")
     resume(unfinished)
-    assert not list(unfinished.rglob("*.part"))
+    assert [path.name for path in unfinished.rglob("*.part")] == ["movie.part"]
     assert not (unfinished / "checkpoints").exists()
 
 

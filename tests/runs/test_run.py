@@ -29,7 +29,6 @@ from tsbench.core import words
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.core.policy import Policy
-from tsbench.evaluation.protocol import PROTOCOLS, SMOKE
 from tsbench.runs import config
 from tsbench.runs import directory as record
 from tsbench.runs import execute as run
@@ -229,8 +228,8 @@ def test_evaluate_says_when_a_score_is_not_what_the_policy_earns(
     assert "solved_reward must be that of the perturbed starts" in capsys.readouterr().err
 
 
-def test_another_physics_is_played_beside_and_never_kept(
-    finished: Path, quick: str, capsys: pytest.CaptureFixture[str]
+def test_another_physics_is_played_beside(
+    finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["evaluate", "one", "--physics", "half_step", "--json", "two.json"]
     assert cli.main(words) == 0
@@ -254,10 +253,6 @@ def test_another_physics_is_played_beside_and_never_kept(
     }
     assert cli.main(["evaluate", "one", "--physics", "round"]) == 2
     assert "unknown physics 'round'; allowed: elliptic, half_step, warp" in capsys.readouterr().err
-    keep = ["evaluate", "one", "--protocol", quick, "--physics", "elliptic", "--keep", "board"]
-    assert cli.main(keep) == 2
-    assert "--keep copies scores by a protocol alone: leave out --ph" in capsys.readouterr().err
-    assert not Path("board").exists()
 
 
 def test_evaluate_replays_where_the_machine_differs(
@@ -270,149 +265,6 @@ def test_evaluate_replays_where_the_machine_differs(
     shown = capsys.readouterr().out
     assert "compared within 0.05 (extensions X86_V9 there, " in shown
     assert "physics replayed from the action log: equal" in shown
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> str:
-    """A protocol that takes seconds, and whose scores can be ranked."""
-    monkeypatch.setitem(PROTOCOLS, "quick", replace(SMOKE, name="quick", ranked=True))
-    return "quick"
-
-
-def test_a_kept_run_is_an_entry(
-    finished: Path, quick: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    keep = ["evaluate", "one", "--protocol", quick, "--keep"]
-    assert cli.main([*keep, "board/entry"]) == 0
-    assert "kept in board/entry" in capsys.readouterr().out
-    entry = Path("board/entry")
-    assert names(entry) == {
-        "actions.npz", "config.yaml", "plan.npz", "policy.json", "policy.safetensors",
-        "reference.npz", "score.json", "versions.json",
-    }  # fmt: skip
-    for name in names(entry) - {"score.json", "actions.npz"}:
-        assert (entry / name).read_bytes() == (finished / name).read_bytes()
-    kept, before = RunDirectory(entry).record(), RunDirectory(finished).record()
-    assert replace(kept, score=before.score) == before
-    assert kept.score.robustness == before.score.robustness
-    assert kept.score.origin.protocol == PROTOCOLS[quick]
-    assert cli.main(["evaluate", "board/entry"]) == 0
-    assert "compared bit for bit: equal" in capsys.readouterr().out
-    assert cli.main([*keep, "board/entry"]) == 2
-    assert "board/entry exists and nothing is overwritten" in capsys.readouterr().err
-    assert cli.main([*keep, "board/entry/score.json/x"]) == 2
-    assert "board/entry/score.json/x: Not a directory" in capsys.readouterr().err
-    assert cli.main(["evaluate", "one", "--keep", "other"]) == 2
-    assert "a score by protocol smoke cannot be an entry" in capsys.readouterr().err
-    (finished / "versions.json").unlink()
-    assert cli.main([*keep, "other"]) == 2
-    assert "one is no finished run: it lacks versions.json" in capsys.readouterr().err
-    assert not Path("other").exists()
-
-
-def test_a_run_of_any_method_can_be_kept(
-    quick: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A method without a plan gives an entry, and the pages can be made from that entry."""
-    monkeypatch.chdir(tmp_path)
-    words = ["task=rocket_navigation", "method=monolithic", "budget=smoke"]
-    assert cli.main(["run", *words, "task.budgets.smoke.act=512", "directory=one"]) == 0
-    assert names(Path("one")) == EVERYTHING - {"plan.npz", "reference.npz"}
-    assert cli.main(["evaluate", "one", "--protocol", quick, "--keep", "entry"]) == 0
-    assert names(Path("entry")) == {
-        "actions.npz", "config.yaml", "policy.json", "policy.safetensors", "score.json",
-        "versions.json",
-    }  # fmt: skip
-    assert RunDirectory(Path("entry")).record().method == "monolithic"
-    assert cli.main(["evaluate", "entry"]) == 0
-    assert "compared bit for bit: equal" in capsys.readouterr().out
-    assert cli.main(["view", "entry", "--html", "entry.html"]) == 0
-    assert cli.main(["report", "entry"]) == 0
-    assert "without a plan" in Path("entry/report.html").read_text()
-
-
-def test_a_score_by_another_seed_is_no_entry(finished: Path, quick: str) -> None:
-    """The changed protocol has the same name and says that it is ranked."""
-    run = RunDirectory(finished)
-    score = run.record().score
-    for other in (replace(PROTOCOLS[quick], seed=1), replace(PROTOCOLS[quick], perturbed=9)):
-        forged = replace(score, origin=replace(score.origin, protocol=other), log=run.actions())
-        with pytest.raises(TsbenchError, match="another seed or other numbers than protocol quick"):
-            record.keep(run, Path("board"), forged)
-    assert not Path("board").exists()
-    right = replace(score.origin, protocol=PROTOCOLS[quick])
-    record.keep(run, Path("board"), replace(score, origin=right, log=run.actions()))
-    assert RunDirectory(Path("board")).record().score == replace(score, origin=right)
-
-
-def other_score(run: Path, *path: str, value: Any) -> None:
-    content = json.loads((run / "score.json").read_text())
-    inner = content
-    for name in path[:-1]:
-        inner = inner[name]
-    inner[path[-1]] = value
-    (run / "score.json").write_text(json.dumps(content))
-
-
-def other_config(run: Path, before: str, after: str) -> None:
-    text = (run / "config.yaml").read_text()
-    assert before in text
-    (run / "config.yaml").write_text(text.replace(before, after))
-
-
-def plan_of_another_task(run: Path) -> None:
-    plan = Plan.load(run / "plan.npz")
-    replace(plan, task="rocket_obstacles").save(run / "plan.npz")
-
-
-@pytest.mark.parametrize(
-    ("spoil", "line"),
-    [
-        (lambda run: (run / "reference.npz").write_bytes(b"PK"), "damaged"),
-        (plan_of_another_task, "rocket_obstacles"),
-        (lambda run: other_score(run, "task", value="laikago_trot"), "disagree on the task"),
-        (lambda run: other_score(run, "method", value="mine"), "disagree on the method"),
-        (
-            lambda run: other_config(run, "name: twostage", "name: monolithic"),
-            "disagree on the method",
-        ),
-        (
-            lambda run: other_score(run, "task_version", value=7),
-            "disagree on the version of the task",
-        ),
-        (lambda run: other_config(run, "seed: 3", "seed: 4"), "disagree on the seed"),
-        (lambda run: other_score(run, "budget", value="fast"), "disagree on the budget"),
-        (
-            lambda run: other_score(run, "score", "origin", "policy", value="0" * 64),
-            "one mixes several runs: its files disagree on the policy",
-        ),
-        (lambda run: other_score(run, "standard", value=False), "changed constants"),
-        (lambda run: (run / "versions.json").write_text("hi"), "damaged versions"),
-    ],
-)
-def test_what_does_not_belong_together_is_no_entry(
-    finished: Path,
-    quick: str,
-    capsys: pytest.CaptureFixture[str],
-    spoil: Callable[[Path], object],
-    line: str,
-) -> None:
-    spoil(finished)
-    assert cli.main(["evaluate", "one", "--protocol", quick, "--keep", "board"]) == 2
-    assert line in capsys.readouterr().err
-    assert not Path("board").exists()
-
-
-def test_a_score_that_does_not_repeat_is_no_entry(
-    finished: Path, quick: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["evaluate", "one", "--protocol", quick, "--keep", "good"]) == 0
-    other_score(Path("good"), "score", "nominal", "normalized_reward", value=0.99)
-    words = ["evaluate", "good", "--keep", "bad", "--json", "figures.json"]
-    assert cli.main(words) == 1
-    assert "not kept: the score differs from the recorded one" in capsys.readouterr().out
-    assert not Path("bad").exists()
-    assert json.loads(Path("figures.json").read_text())["comparison"]["agrees"] is False
 
 
 @pytest.mark.usefixtures("finished")

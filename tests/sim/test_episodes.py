@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tsbench.core.arrays import Array
+from tsbench.core.errors import TsbenchError
 from tsbench.core.state import State
 from tsbench.core.task import MDP
 from tsbench.sim.episodes import Episodes, play
@@ -107,6 +108,16 @@ def test_one_episode(
     assert episodes.normalized.tolist() == pytest.approx([total / 20.0])  # 2 x 10 steps
     assert episodes.final.x.tolist() == pytest.approx([start + length * speed])
     assert episodes.final.time.tolist() == pytest.approx([0.5 * length])
+
+
+def test_an_action_that_is_not_finite_ends_the_play() -> None:
+    """Though the state may stay finite: physics takes such an action for zero."""
+    mdp = Walk([0.0], [0.0])
+    mdp.advance = lambda state, action, rows=None: Line(  # type: ignore[method-assign]
+        state.time + 0.5, state.x, state.speed, state.hurt
+    )
+    with pytest.raises(TsbenchError, match="action of environment 0 is not finite at step 1"):
+        play(mdp, mdp, lambda observation: np.full((1, 1), np.nan), 1)
 
 
 def test_many_side_by_side() -> None:

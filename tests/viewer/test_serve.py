@@ -7,9 +7,11 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -52,6 +54,47 @@ def test_a_page_with_or_without_a_push() -> None:
         assert fetch(f"{url}?push=100N%400.5s%3A%2By") == (200, "<p>100N@0.5s:+y</p>")
         assert fetch(f"{url}?push=bad") == (400, "cannot read the push 'bad'")
         assert fetch(f"{url}favicon.ico")[0] == 404
+
+
+def test_other_sites_cannot_order_pages() -> None:
+    """By a name of theirs that leads here (DNS rebinding), or by a link or form."""
+    with running(render) as url:
+        for headers in ({"Host": "evil.example"}, {"Sec-Fetch-Site": "cross-site"}):
+            asked = urllib.request.Request(f"{url}?push=100N%400.5s%3A%2By", headers=headers)
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(asked, timeout=60)
+        same = urllib.request.Request(url, headers={"Sec-Fetch-Site": "same-origin"})
+        assert urllib.request.urlopen(same, timeout=60).status == 200
+
+
+def test_one_page_for_all_who_ask_at_once() -> None:
+    made: list[str | None] = []
+
+    def slow(push: str | None) -> str:
+        made.append(push)
+        time.sleep(0.3)
+        return "page"
+
+    with running(slow) as url, ThreadPoolExecutor(20) as pool:
+        answers = list(pool.map(fetch, [url] * 20))
+    assert made == [None]
+    assert {status for status, _ in answers} <= {200, 503}
+    assert (200, "page") in answers
+
+
+def test_closing_waits_for_the_page_in_the_making() -> None:
+    began, ended = threading.Event(), threading.Event()
+
+    def slow(_: str | None) -> str:
+        began.set()
+        time.sleep(0.3)
+        ended.set()
+        return "page"
+
+    with running(slow) as url:
+        threading.Thread(target=fetch, args=(url,)).start()
+        assert began.wait(60)
+    assert ended.is_set()
 
 
 def test_a_page_is_made_once() -> None:

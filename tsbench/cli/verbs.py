@@ -168,7 +168,7 @@ def _check_graphics() -> None:
 
 
 def _help() -> str:
-    verbs = "\n".join(f"  {name:<10}{verb.summary}" for name, verb in VERBS.items())
+    verbs = "\n".join(f"  {name:<13}{verb.summary}" for name, verb in VERBS.items())
     return f"""\
 usage: tsbench COMMAND ...
 
@@ -322,8 +322,6 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="ALGORITHM",
         help="the algorithm that saved the .zip, which can run any code when it is loaded",
     )
-    help_keep = "copy a finished run and this score into a new directory, as in leaderboards/"
-    parser.add_argument("--keep", type=Path, metavar="DIRECTORY", help=help_keep)
     options = parser.parse_args(words)
     from tsbench import tasks
     from tsbench.cli import tables
@@ -344,11 +342,7 @@ def _evaluate(words: Sequence[str]) -> int:
     if name not in PROTOCOLS:
         raise unknown("protocol", name, PROTOCOLS)
     protocol = PROTOCOLS[name]
-    log = run.actions() if kept else None
-    if options.keep is not None:
-        directory.check_keep(run, options.keep, protocol)
-        if options.physics is not None:
-            parser.error("--keep copies scores by a protocol alone: leave out --physics")
+    log = run.actions(task) if kept else None
     if options.physics is not None and options.physics not in PHYSICS:
         raise unknown("physics", options.physics, PHYSICS)
     engine = _engine(options.physics)
@@ -364,7 +358,8 @@ def _evaluate(words: Sequence[str]) -> int:
     if kept is not None:
         comparison = compare(kept.score, score, task, log)
         agrees = comparison.agrees
-        shown = directory.shown(replace(kept, score=score)) | {"comparison": vars(comparison)}
+        made = replace(kept, score=score, standard=standard)
+        shown = directory.shown(made) | {"comparison": vars(comparison)}
         line = f" {run.score_file}: {comparison.words}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if options.physics is not None:
@@ -387,14 +382,7 @@ def _evaluate(words: Sequence[str]) -> int:
         )
         shown |= {"physics": {"score": other.as_dict(), "flips": [vars(one) for one in flipped]}}
     write_json(options.json, shown)
-    if agrees is False:
-        if options.keep is not None:
-            console.print(" not kept: the score differs from the recorded one", highlight=False)
-        return 1
-    if options.keep is not None:
-        directory.keep(run, options.keep, score)
-        console.print(f" kept in {options.keep}", highlight=False, markup=False, soft_wrap=True)
-    return 0
+    return int(agrees is False)
 
 
 def _engine(physics: str | None) -> Any:
@@ -427,13 +415,7 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
     from tsbench.evaluation import foreign, references
     from tsbench.runs.directory import RunDirectory
 
-    name = None
-    if word is not None:
-        key, separator, name = word.partition("=")
-        if key != "task" or not separator:
-            raise TsbenchError(f"expected task=NAME, not {word!r}")
-        if name not in tasks.names():
-            raise unknown("task", name, tasks.names())
+    name = None if word is None else _task_name(word)
     if trust_sb3 is not None and path.suffix != ".zip":
         raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
     if path.is_dir():
@@ -449,6 +431,22 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
         raise TsbenchError(f"no run directory {path}")
     task = tasks.checked(name)
     return references.named(path, task) or foreign.load(path, task, trust_sb3), task
+
+
+def _task_name(word: str) -> str:
+    """The name in the word task=NAME.
+
+    Raises:
+        TsbenchError: the word is another, or there is no such task.
+    """
+    from tsbench import tasks
+
+    key, separator, name = word.partition("=")
+    if key != "task" or not separator:
+        raise TsbenchError(f"expected task=NAME, not {word!r}")
+    if name not in tasks.names():
+        raise unknown("task", name, tasks.names())
+    return name
 
 
 def _threads(word: str) -> int:
@@ -626,6 +624,236 @@ def _bench(words: Sequence[str]) -> None:
     write_json(options.json, findings.as_dict())
 
 
+def _export(words: Sequence[str]) -> None:
+    parser = _parser("export", json=False)
+    what = "an .onnx file, a stable-baselines3 .zip, or a .pt file of a state dict"
+    parser.add_argument("model", type=Path, metavar="MODEL", help=what)
+    parser.add_argument("task", metavar="task=NAME", help="that the policy is for")
+    parser.add_argument("directory", type=Path, metavar="DIRECTORY", help="a new one")
+    parser.add_argument("--method", required=True, metavar="NAME", help="that made the policy")
+    parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
+    normalise = "VecNormalize's statistics beside a .zip; loading them runs code too"
+    parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=normalise)
+    parser.add_argument("--activation", metavar="NAME", help="of a .pt file's hidden layers")
+    options = parser.parse_args(words)
+    from tsbench import tasks
+    from tsbench.core.files import check_new
+    from tsbench.evaluation import export
+
+    task = tasks.make(_task_name(options.task))
+    check_new(options.directory, parents=True)
+    found = export.read(
+        options.model,
+        task,
+        algorithm=options.trust_sb3,
+        vecnormalize=options.vecnormalize,
+        activation=options.activation,
+    )
+    policy, difference = export.policy_of(found, task, options.method)
+    options.directory.mkdir(parents=True)
+    policy.save(options.directory)
+    sys.stdout.write(
+        f"{options.directory}: actions differ by at most {difference:.1g} from the model's\n"
+    )
+
+
+BOARD = Path("leaderboards")
+
+
+def _submit(words: Sequence[str]) -> int:
+    parser = _parser("submit")
+    flag = parser.add_argument
+    flag("runs", nargs="+", type=Path, metavar="RUN", help="a run, or an exported policy")
+    flag("--name", required=True, help="of the entry: its directory")
+    flag("--author", required=True, action="append", metavar="NAME", help="one of the authors")
+    flag("--licence", required=True, metavar="NAME", help="of the files, e.g. MIT")
+    flag("--url", help="where the method is described")
+    flag("--hardware", metavar="TEXT", help="that trained it")
+    flag("--tuning-trials", type=_count, metavar="N", help="trainings that decided on settings")
+    flag("--trained", type=_seeds, metavar="SEEDS", help="all that were trained, e.g. 0-9 (RUNs')")
+    flag("--rescore", action="store_true", help="score again what has a score")
+    flag("--check", action="store_true", help="run the whole verification and keep nothing")
+    flag("--board", type=Path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--threads", type=_threads, metavar="N", help="CPU threads (all)")
+    told = parser.add_argument_group("of policies that tsbench did not train")
+    told.add_argument("--seeds", type=_seeds, metavar="SEEDS", help="one for each RUN, e.g. 0-2")
+    told.add_argument("--steps", type=_count, metavar="N", help="environment steps of each")
+    told.add_argument("--seconds", type=float, metavar="S", help="of each training")
+    told.add_argument("--command", metavar="TEXT", help="that trained them")
+    told.add_argument("--code", metavar="COMMIT", help="of the code that trained them")
+    options = parser.parse_args(words)
+    from tsbench.core.files import write_json
+    from tsbench.evaluation.evaluate import evaluate
+    from tsbench.evaluation.protocol import V1
+    from tsbench.leaderboard import submission, verify
+    from tsbench.runs.progress import progress_bar
+
+    console = Console(stderr=True)
+    try:
+        described = submission.Described(
+            entry=options.name,
+            authors=tuple(options.author),
+            licence=options.licence,
+            url=options.url,
+            hardware=options.hardware,
+            tuning_trials=options.tuning_trials,
+            seeds_trained=tuple(options.trained or ()),
+        )
+    except ValueError as error:
+        raise TsbenchError(str(error)) from None
+    foreign = (options.seeds, options.steps, options.seconds, options.command)
+    if None not in foreign and len(options.seeds) != len(options.runs):
+        parser.error(f"{len(options.seeds)} --seeds for {len(options.runs)} runs")
+    given = (
+        submission.Told(tuple(options.seeds), options.command, options.steps, options.seconds,
+                        options.code)
+        if None not in foreign else None
+    )  # fmt: skip
+
+    def score(policy: Any, task: Any) -> Any:
+        with progress_bar(console, "evaluate") as progress:
+            return evaluate(policy, task, protocol=V1, threads=options.threads, progress=progress)
+
+    packed = submission.pack(
+        options.runs, described, options.board, V1, told=given, score=score,
+        rescore=options.rescore,
+    )  # fmt: skip
+    try:
+        asked = verify.Asked(rescore=options.check, threads=options.threads)
+        verdict = verify.verify(packed, asked, _tell(console))
+        _show_verdict(Console(), verdict)
+        if verdict.passed and not options.check:
+            home = submission.place(packed, options.board, V1, options.runs)
+            sys.stdout.write(f"{home}\n")
+    finally:
+        submission.discard(packed)
+    write_json(options.json, verify.plain(verdict))
+    return int(not verdict.passed)
+
+
+def _verify(words: Sequence[str]) -> int:
+    parser = _parser("verify")
+    flag = parser.add_argument
+    flag("entries", nargs="*", type=Path, metavar="ENTRY", help="directories of entries")
+    flag("--all", action="store_true", help="every entry of the board")
+    flag("--quick", action="store_true", help="replay the kept actions only, in seconds")
+    flag("--seed-file", type=Path, metavar="FILE", help="score from the hidden starts too")
+    flag("--retrain", action="store_true", help="train again by the recorded configuration")
+    flag("--record", action="store_true", help="keep the verdicts in verdicts/ of the board")
+    flag("--retract", metavar="REASON", help="take the entries back, and keep that verdict")
+    flag("--pull-request", metavar="BASE", help="the entries that HEAD adds to this commit")
+    flag("--in", dest="checkout", type=Path, default=Path(), metavar="DIRECTORY",
+         help="with --pull-request: the repository (here)")  # fmt: skip
+    flag("--comment", type=_new_file, metavar="FILE", help="write the verdicts as Markdown too")
+    flag("--board", type=Path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--threads", type=_threads, metavar="N", help="CPU threads (all)")
+    options = parser.parse_args(words)
+    if sum((bool(options.entries), options.all, options.pull_request is not None)) != 1:
+        parser.error("one of ENTRY, --all and --pull-request BASE is needed")
+    from tsbench.core.files import write_json, write_new
+    from tsbench.leaderboard import pull_request, verify
+
+    console = Console()
+    faults: list[str] = []
+    if options.pull_request is not None:
+        entries, faults = pull_request.entries(options.checkout, options.pull_request)
+    else:
+        entries = verify.entries(options.board) if options.all else options.entries
+    if options.all and not entries:
+        raise TsbenchError(f"no entries in {options.board}")
+    train = None
+    if options.retrain:
+        from tsbench.runs.execute import execute
+
+        train = execute
+    seed = options.seed_file and verify.hidden_seed(options.seed_file, options.board)
+    asked = verify.Asked(not options.quick, seed, train, options.threads)
+    verdicts = []
+    for fault in faults:
+        console.print(f"refused: {fault}", markup=False, highlight=False, soft_wrap=True)
+    for entry in () if faults else entries:
+        if options.retract is not None:
+            verdict = verify.retracted(entry, options.retract)
+        else:
+            verdict = verify.verify(entry, asked, _tell(Console(stderr=True)))
+        _show_verdict(console, verdict)
+        verdicts.append(verdict)
+        if verdict.digest and (options.record or options.retract is not None):
+            sys.stdout.write(f"{verify.record(options.board, entry, verdict)}\n")
+    if options.comment:
+        write_new(options.comment, verify.comment(verdicts, faults).encode())
+    shown = {"refused": faults, "verdicts": [verify.plain(verdict) for verdict in verdicts]}
+    write_json(options.json, shown)
+    if options.retract is not None:
+        return 0
+    return int(bool(faults) or not all(verdict.passed for verdict in verdicts))
+
+
+def _leaderboard(words: Sequence[str]) -> None:
+    parser = _parser("leaderboard", json=False)
+    flag = parser.add_argument
+    flag("--board", type=Path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--html", type=Path, metavar="DIRECTORY", help="write the site there")
+    flag("--plain", action="store_true", help="a site without 3-D views and figures, in seconds")
+    flag("--readme", action="store_true", help="write the tables into README.md of the board")
+    options = parser.parse_args(words)
+    from tsbench.core.errors import os_errors
+    from tsbench.core.files import write_whole
+    from tsbench.leaderboard import page
+    from tsbench.viewer import report
+
+    if options.html:
+        render = None if options.plain else report.render
+        written = page.write_site(options.board, options.html, render, _tell(Console(stderr=True)))
+        sys.stdout.write(f"{written[0]}\n")
+    if options.readme or not options.html:
+        readme = options.board / "README.md"
+        with os_errors(readme):
+            before = readme.read_text(encoding="utf-8") if readme.exists() else "# Leaderboards\n"
+            text = page.markdown(*page.tables(options.board), before.partition("\n## ")[0])
+            if options.readme:
+                write_whole(readme, text.encode())
+        sys.stdout.write(f"{readme}\n" if options.readme else text.partition("\n## ")[2])
+
+
+def _tell(console: Console) -> Callable[[str], None]:
+    return lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _show_verdict(console: Console, verdict: Any) -> None:
+    from tsbench.core.words import number
+
+    say = _tell(console)
+    state = verdict.state or "refused"
+    passed = "passed" if verdict.passed else "FAILED"
+    say(f"{verdict.entry}: {state}, {passed}, {verdict.seconds:.0f} s")
+    for reason in verdict.reasons:
+        say(f"  {reason}")
+    for one in verdict.figures:
+        if one.verified is not None and one.verified != one.claimed:
+            say(
+                f"  seed {one.seed}, {one.name}: claimed {number(one.claimed)}, "
+                f"verified {number(one.verified)}, difference {one.verified - one.claimed:+.2g}"
+            )
+
+
+def _count(word: str) -> int:
+    return _whole_number(word, 0, 2**53 - 1)
+
+
+def _seeds(word: str) -> list[int]:
+    """Seeds as words say them: 0-2,5."""
+    found: list[int] = []
+    for part in word.split(","):
+        first, dash, last = part.partition("-")
+        low = _whole_number(first, 0, 2**32 - 1)
+        high = _whole_number(last, low, 2**32 - 1) if dash else low
+        if high - low >= 1000:
+            raise argparse.ArgumentTypeError(f"more than 1000 seeds: {part!r}")
+        found += range(low, high + 1)
+    return found
+
+
 VERBS = {
     "run": Verb("train a policy and evaluate it", _run),
     "evaluate": Verb("score a policy by a protocol", _evaluate),
@@ -634,6 +862,10 @@ VERBS = {
     "tune": Verb("search for good settings of a method, shared by processes", _tune),
     "collect": Verb("keep the scores, curves and best policies of many runs as data", _collect),
     "figures": Verb("make the paper's figures and its table again, from runs or results", _figures),
+    "export": Verb("write a policy of another library as tsbench's own file", _export),
+    "submit": Verb("pack runs into an entry of the leaderboard", _submit),
+    "verify": Verb("check whether entries of the leaderboard hold what they claim", _verify),
+    "leaderboard": Verb("show the leaderboard: as tables, or as a site", _leaderboard),
     "bench": Verb("measure speed, beside alternatives", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
 }

@@ -3,23 +3,48 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
+LONGEST = 2000  # characters of a message
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = 80
+_short.maxlevel = 2
+
+
+def quoted(value: object) -> str:
+    """A value from outside for a message: its `repr`, shortened in the middle."""
+    try:
+        return _short.repr(value)
+    except ValueError:  # a whole number of more digits than Python writes
+        return "a huge number"
+
+
+def plain_line(text: str) -> str:
+    """The text on one line, cut in the middle if it is long, without control characters."""
+    if len(text) > LONGEST:
+        text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+    text = " ".join(text.splitlines())
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
 
 class TsbenchError(Exception):
     """A mistake that the user can correct.
 
-    The message is one line in plain words, even if it quotes a text of several lines. The command
-    line prints it after `tsbench: ` on the error stream and exits with status 2; no traceback is
-    shown.
+    The message is one line in plain words, even if it quotes a long text of several lines or of
+    control characters. The command line prints it after `tsbench: ` on the error stream and exits
+    with status 2; no traceback is shown.
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.splitlines()))
+        super().__init__(plain_line(message))
 
 
 class PlanError(TsbenchError):
@@ -63,6 +88,8 @@ def unknown(
         causes: reasons why further names are unavailable, one line each.
     """
     names = sorted(allowed)
+    if len(given) > 80:  # to compare it with the names would take long
+        given = f"{given[:40]}...{given[-37:]}"
     message = f"unknown {kind} '{given}'; allowed: {', '.join(names) or 'none'}"
     near = difflib.get_close_matches(given, names, n=1)
     message += f" (did you mean '{near[0]}'?)" if near else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import math
 import struct
 import zipfile
 import zlib
@@ -15,16 +16,22 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from tsbench.core.arrays import Array, array_namespace, step_of
-from tsbench.core.errors import TsbenchError
-from tsbench.core.files import write_whole
+from tsbench.core.errors import TsbenchError, quoted
+from tsbench.core.files import read_file, write_whole
 
 # Exceptions that numpy and zipfile raise for damaged files. RuntimeError covers encrypted members
 # and unknown compression methods.
 _DAMAGE = (
     OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, MemoryError, OverflowError,
-    zlib.error, zipfile.BadZipFile, struct.error,
+    zlib.error, zipfile.BadZipFile, struct.error, SyntaxError,
 )  # fmt: skip
 
+# Limits of a recording's file. A reference motion of 20 s at 100 Hz takes 1 MB unpacked.
+MAX_FILE = 4 * 2**20  # bytes
+MAX_UNPACKED = 16 * 2**20  # bytes of all arrays together
+MAX_ARRAYS = 32
+MAX_FRAMES = 20_000
+_KINDS = "bifU"  # of arrays: truth values, numbers and text, nothing that is unpickled
 
 _ORIGIN = ("task", "task_version", "timestep")  # fields of every recording
 
@@ -48,7 +55,7 @@ class _Recording:
     def _problem(self) -> str | None:
         for name, kind in (("task", str), ("task_version", int), ("timestep", float)):
             if type(getattr(self, name)) is not kind:
-                return f"{name} must be {kind.__name__}, not {getattr(self, name)!r}"
+                return f"{name} must be {kind.__name__}, not {quoted(getattr(self, name))}"
         if not (np.isfinite(self.timestep) and self.timestep > 0.0):
             return f"the time step is {self.timestep}, it must be positive"
         for name, ndim in self.dimensions.items():
@@ -58,6 +65,8 @@ class _Recording:
             if array.dtype != np.float64:
                 return f"{name} is of type {array.dtype}"
         for name, array in self.arrays.items():
+            if len(array) > MAX_FRAMES:
+                return f"{name} has {len(array)} frames, at most {MAX_FRAMES} are allowed"
             if array.dtype.kind == "f" and not np.all(np.isfinite(array)):
                 return f"{name} holds values that are not finite"
         return None
@@ -111,21 +120,58 @@ class _Recording:
 
 
 def _content(path: Path, kind: str) -> dict[str, np.ndarray]:
-    """The arrays of a recording's file.
+    """The arrays of a recording's file, whose sizes are looked at before anything is unpacked.
 
     Raises:
-        TsbenchError: the file is missing or damaged.
+        TsbenchError: the file is missing, damaged, or beyond the limits.
     """
+    packed = read_file(path, MAX_FILE, kind)
     try:
-        if path.is_file() and not zipfile.is_zipfile(path):
-            raise TsbenchError(f"damaged {kind} file {path}: it is no npz file")
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise TsbenchError(f"no {kind} at {path}") from None
+        if not zipfile.is_zipfile(io.BytesIO(packed)):
+            raise ValueError("it is no npz file")
+        with zipfile.ZipFile(io.BytesIO(packed)) as file:
+            members = file.infolist()
+            if len(members) > MAX_ARRAYS:
+                raise ValueError(f"it holds {len(members)} arrays, at most {MAX_ARRAYS} may be")
+            if sum(member.file_size for member in members) > MAX_UNPACKED:
+                raise ValueError(f"unpacked it is larger than {MAX_UNPACKED:,} bytes")
+            content = {}
+            for member in members:
+                name = member.filename.removesuffix(".npy")
+                try:
+                    content[name] = _array(_unpacked(file, member))
+                except ValueError as error:
+                    raise ValueError(f"{quoted(name)}: {error}") from None
+        if len(content) < len(members):
+            raise ValueError("an array is there twice")
     except _DAMAGE as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = str(error) or type(error).__name__
         raise TsbenchError(f"damaged {kind} file {path}: {reason}") from None
+    return content
+
+
+def _unpacked(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
+    """A member's data, and no more than the directory says, however much they would inflate to."""
+    with file.open(member) as opened:
+        return opened.read(member.file_size)
+
+
+def _array(data: bytes) -> np.ndarray:
+    """The array of an npy file in memory, made only once its header fits its size.
+
+    Raises:
+        ValueError: the data are no npy file of version 1, or of a kind that a recording lacks.
+    """
+    stream = io.BytesIO(data)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError("it is of another version of the npy format")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype.kind not in _KINDS:
+        raise ValueError(f"it is of type {quoted(str(dtype))}")
+    if math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError(f"its size is not that of its shape {quoted(shape)}")
+    flat = np.frombuffer(data, dtype, offset=stream.tell())
+    return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
 
 
 def _plain(value: np.ndarray) -> Any:

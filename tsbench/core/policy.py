@@ -17,11 +17,17 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from tsbench.core.arrays import Array, array_namespace
-from tsbench.core.errors import TsbenchError, unknown
-from tsbench.core.files import write_whole
+from tsbench.core.errors import TsbenchError, quoted, unknown
+from tsbench.core.files import read_file, read_json, write_whole
 from tsbench.core.typed import typed
 
 FORMAT = 1
+
+# Limits of the files. The largest kept network takes 184 KB.
+MAX_INFO = 16 * 2**10  # bytes
+MAX_FILE = 8 * 2**20  # bytes: two million weights
+MAX_HEADER = 16 * 2**10  # bytes of the safetensors file's header
+MAX_LAYERS = 16
 
 
 def _elu(x: np.ndarray) -> np.ndarray:
@@ -54,6 +60,10 @@ def _symlog(x: Array) -> Array:
 ENCODINGS: dict[str, Callable[[Array], Array]] = {"plain": _plain, "symlog": _symlog}
 
 
+# Applied to what the last layer returns, before it is clipped to [-1, 1].
+OUTPUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"clip": _plain, "tanh": np.tanh}
+
+
 @dataclass(frozen=True)
 class PolicyInfo:
     """The content of `policy.json`.
@@ -68,6 +78,8 @@ class PolicyInfo:
         sha256: hash of `policy.safetensors`.
         encoding: encoding of observations before normalisation, a name in `ENCODINGS`.
         format: version of the file format.
+        output: what is applied to the last layer, a name in `OUTPUTS`.
+        bound: normalised observations are clipped to [-bound, bound]; None for no bound.
     """
 
     task: str
@@ -79,6 +91,8 @@ class PolicyInfo:
     sha256: str = ""
     encoding: str = "plain"
     format: int = FORMAT
+    output: str = "clip"
+    bound: float | None = None
 
 
 @dataclass(frozen=True)
@@ -107,12 +121,17 @@ class Policy:
         """
         activation = ACTIVATIONS[self.info.activation]
         encoded = ENCODINGS[self.info.encoding](np.asarray(observation, np.float32))
-        x = (encoded - self.mean) / self.scale
-        last = len(self.weights) - 1
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = (weight @ x[..., None])[..., 0] + bias  # one matrix-vector product per row
-            if i < last:
-                x = activation(x)
+        # Numbers that overflow end an episode (`sim.dynamics.expect_finite`), without a warning.
+        with np.errstate(over="ignore", invalid="ignore"):
+            x = (encoded - self.mean) / self.scale
+            if self.info.bound is not None:
+                x = np.clip(x, -self.info.bound, self.info.bound)
+            last = len(self.weights) - 1
+            for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+                x = (weight @ x[..., None])[..., 0] + bias  # one matrix-vector product per row
+                if i < last:
+                    x = activation(x)
+            x = OUTPUTS[self.info.output](x)
         return np.clip(x, -1.0, 1.0).astype(np.float64)
 
     def _content(self) -> bytes:
@@ -154,10 +173,12 @@ class Policy:
         directory = Path(directory)
         info = _read_info(directory / "policy.json")
         path = directory / "policy.safetensors"
-        content = _read(path)
+        content = read_file(path, MAX_FILE, "policy file")
         if hashlib.sha256(content).hexdigest() != info.sha256:
             raise TsbenchError(f"{path} is not the file that policy.json describes (hash differs)")
         try:
+            if int.from_bytes(content[:8], "little") > MAX_HEADER:
+                raise ValueError(f"its header is larger than {MAX_HEADER:,} bytes")
             tensors = load(content)
             count = len(info.layers) - 1
             expected_names = {"mean", "scale"}
@@ -193,10 +214,11 @@ class Policy:
 
 
 def _read_info(path: Path) -> PolicyInfo:
-    content = _read(path)
     try:
-        info: PolicyInfo = typed(PolicyInfo, json.loads(content), "")
-    except (ValueError, RecursionError, TsbenchError) as error:
+        info: PolicyInfo = typed(PolicyInfo, read_json(path, MAX_INFO, "policy file"), "")
+    except TsbenchError as error:
+        if str(path) in str(error):
+            raise
         raise TsbenchError(f"damaged policy file {path}: {error}") from None
     if info.format != FORMAT:
         raise TsbenchError(f"{path} has format {info.format}; this tsbench reads {FORMAT}")
@@ -204,15 +226,11 @@ def _read_info(path: Path) -> PolicyInfo:
         raise unknown(f"activation in {path}", str(info.activation), ACTIVATIONS)
     if info.encoding not in ENCODINGS:
         raise unknown(f"encoding in {path}", str(info.encoding), ENCODINGS)
-    if len(info.layers) < 2 or min(info.layers) < 1:
-        raise TsbenchError(f"damaged policy file {path}: layers {info.layers}")
+    if info.output not in OUTPUTS:
+        raise unknown(f"output in {path}", str(info.output), OUTPUTS)
+    if info.bound is not None and info.bound <= 0.0:
+        raise TsbenchError(f"damaged policy file {path}: the bound must be positive")
+    if not 2 <= len(info.layers) <= MAX_LAYERS + 1 or min(info.layers) < 1:
+        layers = f"{quoted(info.layers)}, {MAX_LAYERS} layers at most"
+        raise TsbenchError(f"damaged policy file {path}: layers {layers}")
     return info
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise TsbenchError(f"no policy file {path}") from None
-    except OSError as error:
-        raise TsbenchError(f"cannot read {path}: {error.strerror}") from None

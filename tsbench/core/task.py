@@ -33,6 +33,10 @@ from tsbench.core.state import Course, Readings, Rng, S, Start
 
 Vector = tuple[float, float, float]
 
+# How much a plan or a reference motion may be longer than an episode: in time, and in frames.
+LONGEST_MOTION = 4
+MOST_FRAMES = 16
+
 
 class MDP(ABC, Generic[S]):
     """Observations, rewards and endings of states. Shared by a task and its variants.
@@ -402,9 +406,19 @@ class Plannable(Task[S]):
         """Checks that a plan or reference motion belongs to this task.
 
         Raises:
-            TsbenchError: the motion is for another task or version, or its arrays have other sizes.
+            TsbenchError: the motion is for another task or version, is far longer than an episode,
+                or its arrays have other sizes.
         """
         self.check_origin(motion)
+        frames = len(next(iter(motion.arrays.values())))
+        longest = LONGEST_MOTION * self.horizon
+        if frames > MOST_FRAMES * self.horizon or frames * motion.timestep > (
+            longest * self.timestep
+        ):
+            raise TsbenchError(
+                f"the {motion.kind} is too long: {frames} frames every {motion.timestep:g} s, "
+                f"where an episode has {self.horizon} steps of {self.timestep:g} s"
+            )
         found: dict[str, tuple[int, ...]]
         wanted: dict[str, tuple[int, ...]]
         if isinstance(motion, Plan):

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from tsbench.core.errors import TsbenchError, unknown
+from tsbench.core.errors import TsbenchError, quoted, unknown
 
 
 def typed(kind: Any, value: Any, path: str) -> Any:
@@ -47,7 +47,7 @@ def typed(kind: Any, value: Any, path: str) -> Any:
     if type(value) is kind:
         return value
     wanted = _WORDS.get(kind) or _WORDS.get(origin) or str(kind)
-    raise TsbenchError(f"{path or 'the content'} must be {wanted}, not {value!r}")
+    raise TsbenchError(f"{path or 'the content'} must be {wanted}, not {quoted(value)}")
 
 
 def typed_items(kind: type, value: Any, path: str) -> dict[str, Any]:
@@ -57,7 +57,7 @@ def typed_items(kind: type, value: Any, path: str) -> dict[str, Any]:
         TsbenchError: a key is unknown, or a value has the wrong type or range.
     """
     if not isinstance(value, Mapping):
-        raise TsbenchError(f"{path or 'the content'} must be key: value pairs, not {value!r}")
+        raise TsbenchError(f"{path or 'the content'} must be key: value pairs, not {quoted(value)}")
     hints = get_type_hints(kind)
     allowed = [entry.name for entry in fields(kind)]
     for name in value:

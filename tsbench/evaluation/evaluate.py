@@ -84,6 +84,17 @@ def evaluate(
     )
 
 
+def solved_rewards(
+    policy: PolicyFunction, task: Task[Any], protocol: Protocol, threads: int | None = None
+) -> np.ndarray:
+    """The normalized reward of each perturbed episode, zero where it was not solved, shape (n,).
+    `Score.solved_reward` is their mean."""
+    here = Condition(protocol.name, protocol.physics)
+    episodes = _play(policy, task, perturbed_starts(task, protocol), here, threads, Physics)
+    rewards: np.ndarray = episodes.normalized * task.success(episodes.final, episodes.course)
+    return rewards
+
+
 def _watched(
     policy: PolicyFunction, task: Task[Any], protocol: Protocol, progress: Callable[[float], None]
 ) -> PolicyFunction:
@@ -111,13 +122,20 @@ def check_fit(policy: Policy, task: Task[Any]) -> None:
     """Checks that a policy was trained for this task.
 
     Raises:
-        TsbenchError: the policy was trained for another task, version or physics.
+        TsbenchError: the policy was trained for another task, version or physics, or is of other
+            sizes.
     """
     info = policy.info
     if (info.task, info.task_version) != (task.name, task.version):
         raise TsbenchError(
             f"the policy is for {info.task} version {info.task_version}, "
             f"not for {task.name} version {task.version}"
+        )
+    sizes, wanted = (info.layers[0], info.layers[-1]), (task.observation_size, task.action_size)
+    if sizes != wanted:
+        raise TsbenchError(
+            f"the policy maps {sizes[0]} observations to {sizes[1]} actions, "
+            f"{task.name} has {wanted[0]} and {wanted[1]}"
         )
     if info.physics != fingerprint(task.spec()):
         raise TsbenchError(

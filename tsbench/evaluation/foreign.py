@@ -15,11 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.core.errors import TsbenchError, os_errors, unknown
+from tsbench.core.errors import TsbenchError, quoted, unknown
+from tsbench.core.files import read_file
 from tsbench.core.policy import Policy
 from tsbench.core.task import MDP
 
 ONNX_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+MAX_FILE = 256 * 2**20  # bytes; with the state of its optimiser a model is thrice its network
+REFUSED_OPERATORS = {
+    "Loop", "Scan", "If", "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",
+    "RandomUniform", "RandomUniformLike",
+}  # fmt: skip
 SB3_ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")  # the algorithms with continuous actions
 
 
@@ -32,12 +38,14 @@ class ForeignPolicy:
         observation_size: o.
         action_size: a.
         sha256: hash of the policy's file, or None for a policy without a file.
+        model: the model of stable-baselines3, or None.
     """
 
     answer: Callable[[np.ndarray], Any]
     observation_size: int
     action_size: int
     sha256: str | None = None
+    model: Any = None
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Actions (n, a) for observations (n, o).
@@ -52,7 +60,9 @@ class ForeignPolicy:
         try:
             action = np.asarray(given, float)
         except (TypeError, ValueError):
-            raise TsbenchError(f"the policy's action is not made of numbers: {given!r}") from None
+            raise TsbenchError(
+                f"the policy's action is not made of numbers: {quoted(given)}"
+            ) from None
         if action.shape != (self.action_size,):
             raise TsbenchError(
                 f"the policy's action has shape {action.shape}, not ({self.action_size},)"
@@ -73,14 +83,16 @@ def from_function(function: Callable[[np.ndarray], Any], mdp: MDP[Any]) -> Forei
 def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     """A policy from an ONNX model with one input, (1, o) or (n, o). Its first output is the action.
 
-    An ONNX file is data and cannot run code of its own.
+    An ONNX file is data; it cannot run code of its own. One whose answers may depend on something
+    else than the file and the observation, or which may never answer, is refused.
 
     Raises:
         TsbenchError: onnxruntime is missing, the file is damaged, or its sizes do not fit the task.
     """
     path = Path(path)
-    runtime = _extra("onnxruntime", "onnx")
-    content = _read(path)
+    runtime = extra("onnxruntime", "onnx")
+    content = read(path)
+    _check_graph(content, path)
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1  # more threads would sum in another order
     try:
@@ -122,6 +134,29 @@ def from_onnx(path: Path | str, mdp: MDP[Any]) -> ForeignPolicy:
     )
 
 
+def _check_graph(content: bytes, path: Path) -> None:
+    """
+    Raises:
+        TsbenchError: the file keeps weights in another file, which onnxruntime would look for in
+            the current directory; or it holds loops or random numbers.
+    """
+    onnx = extra("onnx", "onnx")
+    try:
+        model = onnx.load_from_string(content)
+    except Exception as error:  # protobuf's own
+        raise TsbenchError(f"damaged ONNX file {path}: {_line(error)}") from None
+    nodes, tensors = [], list(model.graph.initializer)
+    for graph in (model.graph, *model.functions):
+        nodes += graph.node
+    for node in nodes:
+        if node.op_type in REFUSED_OPERATORS:
+            raise TsbenchError(f"{path} holds the operator {node.op_type}, which is not allowed")
+        tensors += [one.t for one in node.attribute if one.HasField("t")]
+    for tensor in tensors:
+        if tensor.data_location == onnx.TensorProto.EXTERNAL:
+            raise TsbenchError(f"{path} keeps weights in another file: save it as one file")
+
+
 def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
     """A policy from a file that stable-baselines3 saved. It acts deterministically.
 
@@ -134,8 +169,8 @@ def from_sb3(path: Path | str, algorithm: str, mdp: MDP[Any]) -> ForeignPolicy:
     path = Path(path)
     if algorithm not in SB3_ALGORITHMS:
         raise unknown("stable-baselines3 algorithm", algorithm, SB3_ALGORITHMS)
-    baselines = _extra("stable_baselines3", "sb3")
-    content = _read(path)
+    baselines = extra("stable_baselines3", "sb3")
+    content = read(path)
     try:
         model = getattr(baselines, algorithm).load(path, device="cpu")
     except Exception as error:  # pickle, zipfile and torch raise anything
@@ -161,7 +196,7 @@ def from_sb3_model(
     def answer(observation: np.ndarray) -> Any:
         return model.predict(observation.astype(np.float32), deterministic=True)[0]
 
-    return ForeignPolicy(answer, mdp.observation_size, mdp.action_size, sha256)
+    return ForeignPolicy(answer, mdp.observation_size, mdp.action_size, sha256, model)
 
 
 def load(path: Path, mdp: MDP[Any], sb3: str | None = None) -> Policy | ForeignPolicy:
@@ -192,16 +227,25 @@ def load(path: Path, mdp: MDP[Any], sb3: str | None = None) -> Policy | ForeignP
     raise TsbenchError(f"{path} is neither a run directory nor an .onnx or .zip file")
 
 
-def _extra(package: str, extra: str) -> Any:
+def extra(package: str, extra: str) -> Any:
+    """A package that an extra of tsbench brings.
+
+    Raises:
+        TsbenchError: it is not installed.
+    """
     try:
         return importlib.import_module(package)
     except ImportError:
         raise TsbenchError(f"{package} is missing: pip install 'tsbench[{extra}]'") from None
 
 
-def _read(path: Path) -> bytes:
-    with os_errors(path):
-        return path.read_bytes()
+def read(path: Path) -> bytes:
+    """The content of a policy's file.
+
+    Raises:
+        TsbenchError: as `read_file`.
+    """
+    return read_file(path, MAX_FILE, "policy file")
 
 
 def _line(error: Exception) -> str:

@@ -21,11 +21,16 @@ from tsbench.core.task import Task
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import perturbed_starts
-from tsbench.evaluation.score import Score
+from tsbench.evaluation.robustness import impulse_50, mass_scale
+from tsbench.evaluation.score import Score, Summary
 from tsbench.sim.episodes import Episodes, play
 from tsbench.sim.physics import Physics
 
 SAME_REWARD = 1e-12  # relative difference between kernels; other physics differs by more
+# Times the protocol's tolerance, for figures by which nothing is ranked: lengths and measures of
+# the perturbed episodes as shares of themselves, and the share of pushes that end otherwise.
+LOOSE = 3.0
+_IMPULSES = ("impulse_50", "impulse_50_is_lower_bound")
 
 
 def replay(task: Task[Any], score: Score, log: ActionLog) -> bool:
@@ -90,7 +95,7 @@ def compare(kept: Score, again: Score, task: Task[Any], log: ActionLog | None) -
         log: the kept actions of the first score, or None.
     """
     before, now = kept.origin, again.origin
-    if words := _incomparable(before, now):
+    if words := incomparable(before, now):
         return Comparison("none", None, f"not compared: made with {words}")
     others = [
         f"{name} {there.get(name)} there, {value} here"
@@ -102,7 +107,8 @@ def compare(kept: Score, again: Score, task: Task[Any], log: ActionLog | None) -
         same = replace(kept, origin=now) == again
         words = f"compared bit for bit: {'equal' if same else 'DIFFERENT'}"
         return Comparison("exact", same, words)
-    differing = differences(kept, again, best_return(task) / (task.max_reward * task.horizon))
+    differing = contradictions(kept, task)
+    differing += differences(kept, again, best_return(task) / (task.max_reward * task.horizon))
     agrees = not differing
     words = f"compared within {now.protocol.tolerance:g} ({'; '.join(others)}): "
     words += "in agreement" if agrees else f"DIFFERENT: {', '.join(differing)}"
@@ -116,7 +122,7 @@ def compare(kept: Score, again: Score, task: Task[Any], log: ActionLog | None) -
     return Comparison("tolerant", agrees, words)
 
 
-def _incomparable(before: Origin, now: Origin) -> str:
+def incomparable(before: Origin, now: Origin) -> str:
     """The first difference that makes two scores incomparable, in words; empty if there is none."""
     protocol = replace(now.protocol, seed=before.protocol.seed)
     named: list[tuple[str, object, object]] = [
@@ -160,9 +166,75 @@ def differences(kept: Score, again: Score, best: float) -> list[str]:
             bound = protocol.impulse_tolerance * max(first[name], second[name])
         elif name.endswith("_reward"):
             bound *= best
+        elif name.startswith("perturbed: "):
+            bound *= LOOSE * max(abs(first[name]), abs(second[name]))
         # One of twenty episodes is a share of 0.05, which rounding may make larger than the bound.
         if not abs(first[name] - second[name]) <= bound * (1.0 + 1e-9):
             found.append(f"{name} {first[name]:.4g} there, {second[name]:.4g} here")
+    for name in ("survived", "recovered"):
+        cells = [np.array(getattr(one.robustness.surface, name)) for one in (kept, again)]
+        other = float(np.mean(cells[0] != cells[1])) if cells[0].shape == cells[1].shape else 1.0
+        if other > LOOSE * protocol.tolerance:
+            found.append(f"{name}: {other:.0%} of the pushes")
+    return found
+
+
+def contradictions(score: Score, task: Task[Any]) -> list[str]:
+    """What in a score cannot be, whatever the policy: figures that do not follow from each other
+    or from the protocol.
+
+    Args:
+        score: that somebody claims.
+        task: of the score.
+    """
+    protocol, robustness = score.origin.protocol, score.robustness
+    surface, found = robustness.surface, []
+    counts = {"nominal": (score.nominal, 1), "perturbed": (score.perturbed, protocol.perturbed)}
+    counts |= {name: (one, protocol.changed) for name, one in score.changes.items()}
+    for name, (summary, episodes) in counts.items():
+        found += [f"{name}: {what}" for what in _impossible(summary, episodes, task)]
+    if score.changes.keys() != {condition.name for condition in protocol.conditions}:
+        found.append("the changes are not those of the protocol")
+    plans = score.normalized_reward * task.max_reward * task.horizon / best_return(task)
+    if not np.isclose(score.against_plan, plans, rtol=1e-9, atol=1e-12):
+        found.append("against_plan does not follow from normalized_reward")
+    scale = mass_scale(task)
+    forces = np.array(protocol.forces, float) * scale
+    asked = (tuple(forces.tolist()), tuple(protocol.directions().tolist()))
+    phases = tuple(task.push_steps[:: protocol.phases])
+    if (robustness.mass_scale, robustness.push_duration_s) != (scale, protocol.duration) or (
+        surface.forces_N, surface.headings_rad, surface.phases
+    ) != (*asked, phases):  # fmt: skip
+        return [*found, "the pushes are not those of the protocol"]
+    claim = protocol.forces.index(protocol.claim)
+    for kind, cells in (("survival", surface.survived), ("recovery", surface.recovered)):
+        held = np.array(cells)
+        if not np.isin(held, (0, 1)).all():
+            found.append(f"{kind}: a push has another outcome than 0 or 1")
+            continue
+        if getattr(robustness, f"{kind}_100N") != float(held[claim].mean()):
+            found.append(f"{kind}_100N is not that of the surface")
+        claimed = tuple(getattr(robustness, f"{kind}_{n}") for n in _IMPULSES)
+        shares, impulses = held.mean(axis=(1, 2)), forces * protocol.duration
+        # Whether the episode without a push was survived no figure says.
+        possible = [impulse_50(impulses, shares, calm) for calm in (True, False)]
+        if not any(np.allclose(claimed, one, rtol=1e-9, atol=0.0) for one in possible):
+            found.append(f"{kind}_impulse_50 is not that of the surface")
+    return found
+
+
+def _impossible(summary: Summary, episodes: int, task: Task[Any]) -> list[str]:
+    found = []
+    if summary.episodes != episodes:
+        found.append(f"{summary.episodes} episodes, not {episodes}")
+    if not 0.0 < summary.steps <= task.horizon:
+        found.append(f"{summary.steps:.4g} steps of {task.horizon}")
+    if not abs(summary.normalized_reward) <= 1.0:
+        found.append("normalized_reward is beyond 1")
+    if summary.success == 0.0 and summary.solved_reward != 0.0:
+        found.append("solved_reward without a solved episode")
+    if set(summary.measures) != set(task.measure_notes):
+        found.append("the measures are not the task's")
     return found
 
 
@@ -179,6 +251,12 @@ def _figures(score: Score) -> dict[str, float]:
             f"{part}.{name}": getattr(summary, name)
             for part, summary in {"perturbed": score.perturbed, **score.changes}.items()
             for name in ("normalized_reward", "success", "violations")
+        },
+        "perturbed: steps": score.perturbed.steps,
+        **{
+            f"perturbed: {name}": value
+            for name, value in score.perturbed.measures.items()
+            if value is not None
         },
         **{
             f"robustness.{name}": getattr(score.robustness, name)

@@ -86,6 +86,8 @@ class Score:
         for name in ("solved_reward", "normalized_reward", "success"):
             if getattr(self, name) != getattr(self.perturbed, name):
                 raise ValueError(f"{name} must be that of the perturbed starts")
+        if self.nominal.measures.keys() != self.perturbed.measures.keys():
+            raise ValueError("nominal.measures must have the names that perturbed.measures has")
 
     def as_dict(self) -> dict[str, Any]:
         """The score as plain values, without the log."""

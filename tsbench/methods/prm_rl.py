@@ -44,7 +44,7 @@ DETOUR = 1e3  # factor on the cost of an edge that failed: it is taken where not
 SLOWNESS, PATIENCE = 2.0, 2.0  # an edge may take this times the planner's seconds, and 2 s
 ERRAND = 8.0  # s, of an episode of learning to drive
 ROUNDS = 8  # of DAgger
-EPOCHS, LAST = 10, 50  # passes over all that was seen, in a round and in the last one
+EPOCHS, LAST = 10, 20  # passes over all that was seen, in a round and in the last one
 FLIGHTS = 128  # episodes in a round, at most
 CONFIDENCE = 0.95  # of the Wilson bounds
 

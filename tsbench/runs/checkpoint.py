@@ -19,10 +19,12 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from tsbench.core.files import write_whole
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import read_file, write_whole
 from tsbench.core.method import Snapshot
 
 FORMAT = 1
+MAX_FILE = 2**30  # bytes
 KEPT = 2  # checkpoints of each stage: if the last one is damaged, the one before serves
 NAME = re.compile(r"(\d{2})-(\w+)-(\d{12})-([0-9a-f]{64})\.safetensors")
 
@@ -81,11 +83,11 @@ class Checkpoints:
             match = NAME.fullmatch(path.name)
             assert match is not None
             try:
-                data = path.read_bytes()
+                data = read_file(path, MAX_FILE, "checkpoint")
                 if hashlib.sha256(data).hexdigest() != match[4]:
                     raise ValueError("its hash differs")
                 return Checkpoint(int(match[1]), match[2], int(match[3]), path, decode(data))
-            except (OSError, ValueError) as error:
+            except (TsbenchError, ValueError) as error:
                 self._damaged(f"damaged checkpoint {path} ({error}): going back to the one before")
                 with suppress(OSError):  # so that no later run reads it again
                     path.rename(f"{path}.damaged")

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
 from tsbench import tasks
-from tsbench.core.errors import TsbenchError, os_errors
-from tsbench.core.files import check_new, write_json
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import (
+    check_plain,
+    parse_json,
+    read_file,
+    read_json,
+)
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion, Roadmap
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
-from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.score import Score
 from tsbench.runs.config import RunConfig
 
 M = TypeVar("M", Plan, ReferenceMotion)
+
+# Limits of the files, in bytes. The largest of the kept entries are 1, 1 and 40 KB.
+MAX_CONFIG = 16 * 2**10
+MAX_VERSIONS = 64 * 2**10
+MAX_SCORE = 512 * 2**10
+MAX_METRICS = 32 * 2**20
 
 # File names that `workspace` uses. `RunDirectory` has the paths of all files.
 METRICS = "metrics.jsonl"
@@ -88,6 +97,11 @@ class Record:
         return {**asdict(self), "score": self.score.as_dict()}
 
 
+def _there(path: Path) -> bool:
+    """Whether there is anything, be it a link to nothing, which its reader refuses."""
+    return path.exists() or path.is_symlink()
+
+
 class _File:
     """An attribute of a `RunDirectory`: the path of a file with a fixed name."""
 
@@ -142,28 +156,14 @@ class RunDirectory:
     @property
     def finished(self) -> bool:
         """Whether a run in this directory has been trained and scored."""
-        return self.score_file.exists()
-
-    @property
-    def essential(self) -> tuple[Path, ...]:
-        """The files without which a run cannot become an entry."""
-        return (
-            self.config_file, self.versions_file, self.policy_info_file, self.policy_file,
-            self.score_file,
-        )  # fmt: skip
-
-    @property
-    def optional(self) -> tuple[Path, ...]:
-        """The files that an entry has if its method makes them."""
-        return self.plan_file, self.reference_file, self.roadmap_file
+        return _there(self.score_file)
 
     def config(self) -> RunConfig:
         """The configuration of the run."""
         path = self.config_file
+        content = read_file(path, MAX_CONFIG, "configuration")
         try:
-            with os_errors(path):
-                content = yaml.safe_load(path.read_text(encoding="utf-8"))
-            config: RunConfig = typed(RunConfig, content, "")
+            config: RunConfig = typed(RunConfig, _plain_yaml(content), "")
         except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date such as 2026-99-99
             reason = " ".join(str(error).split())
             raise TsbenchError(f"damaged configuration {path}: {reason}") from None
@@ -171,26 +171,26 @@ class RunDirectory:
             raise TsbenchError(f"damaged configuration {path}: {error}") from None
         return config
 
+    @property
+    def command(self) -> str:
+        """The command that made the run: the first line of its configuration."""
+        content = read_file(self.config_file, MAX_CONFIG, "configuration")
+        return content.decode(errors="replace").partition("\n")[0].removeprefix("# ")
+
     def versions(self) -> dict[str, Any]:
         """The content of `versions.json`: versions and hashes of what the run was made with."""
-        path = self.versions_file
-        with os_errors(path):
-            content = path.read_bytes()
-        try:
-            return dict(json.loads(content))
-        except (ValueError, TypeError, RecursionError) as error:
-            raise TsbenchError(f"damaged versions {path}: {error}") from None
+        content = read_json(self.versions_file, MAX_VERSIONS, "versions")
+        if not isinstance(content, dict):
+            raise TsbenchError(f"damaged versions {self.versions_file}: no key: value pairs")
+        return content
 
     def record(self) -> Record:
         """The content of a finished run's `score.json`."""
         path = self.score_file
-        with os_errors(path):
-            content = path.read_bytes()
+        content = read_json(path, MAX_SCORE, "score")
         try:
-            values = json.loads(content)
-            json.dumps(values, allow_nan=False)  # raises where a number is not finite
-            record: Record = typed(Record, values, "")
-        except (ValueError, OverflowError, RecursionError, TsbenchError) as error:
+            record: Record = typed(Record, content, "")
+        except (OverflowError, TsbenchError) as error:
             raise TsbenchError(f"damaged score, or another version's, {path}: {error}") from None
         return record
 
@@ -203,8 +203,13 @@ class RunDirectory:
     def task(self, name: str) -> Task[Any]:
         """The task of that name with the run's constants; without a configuration file, with the
         standard constants."""
-        constants = self.config().task.constants if self.config_file.exists() else {}
-        return tasks.make(name, **constants)
+        constants = self.config().task.constants if _there(self.config_file) else {}
+        try:
+            return tasks.make(name, **constants)
+        except TsbenchError as error:
+            if not constants:
+                raise
+            raise TsbenchError(f"{self.config_file}: {error}") from None
 
     def plan(self, task: Task[Any]) -> Plan | None:
         """The run's plan, or None if it has none.
@@ -228,85 +233,82 @@ class RunDirectory:
         Raises:
             TsbenchError: the file is damaged, or the roadmap is another task's.
         """
-        if not self.roadmap_file.exists():
+        if not _there(self.roadmap_file):
             return None
         roadmap = Roadmap.load(self.roadmap_file)
-        plannable(task).check_origin(roadmap)
+        try:
+            plannable(task).check_origin(roadmap)
+        except TsbenchError as error:
+            raise TsbenchError(f"{self.roadmap_file}: {error}") from None
         return roadmap
 
-    def actions(self) -> ActionLog | None:
-        """The run's action log, or None if it has none."""
-        return ActionLog.load(self.actions_file) if self.actions_file.exists() else None
+    def actions(self, task: Task[Any]) -> ActionLog | None:
+        """The run's action log, or None if it has none.
+
+        Raises:
+            TsbenchError: the file is damaged, or the log is another task's.
+        """
+        if not _there(self.actions_file):
+            return None
+        log = ActionLog.load(self.actions_file)
+        if (log.task, log.task_version) != (task.name, task.version):
+            raise TsbenchError(
+                f"{self.actions_file} is for {log.task} version {log.task_version}, "
+                f"not for {task.name} version {task.version}"
+            )
+        return log
+
+    @property
+    def has_metrics(self) -> bool:
+        """Whether the directory holds the metrics of the training."""
+        return _there(self.metrics_file)
+
+
+def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a run's `metrics.jsonl`, one for each iteration.
+
+    Raises:
+        TsbenchError: the file is missing or damaged.
+    """
+    for line in read_file(path, MAX_METRICS, "metrics").splitlines():
+        try:
+            row = parse_json(line)
+            if not isinstance(row, dict):
+                raise ValueError("a row holds no key: value pairs")
+        except ValueError as error:
+            raise TsbenchError(f"damaged metrics {path}: {error}") from None
+        yield row
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses aliases, with which a short file becomes a huge value, as it reads."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it holds an alias")
+        return super().compose_node(parent, index)
+
+
+def _plain_yaml(content: bytes) -> Any:
+    """
+    Raises:
+        ValueError, YAMLError: the content is no YAML, or holds aliases or values that `check_plain`
+            refuses.
+    """
+    values = yaml.load(content, _PlainLoader)
+    check_plain(values, finite=False)
+    return values
 
 
 def _motion(kind: type[M], path: Path, task: Task[Any]) -> M | None:
-    if not path.exists():
+    if not _there(path):
         return None
     motion = kind.load(path)
-    plannable(task).check_fit(motion)
+    try:
+        plannable(task).check_fit(motion)
+    except TsbenchError as error:
+        raise TsbenchError(f"{path}: {error}") from None
     return motion
-
-
-def check_keep(run: RunDirectory, entry: Path, protocol: Protocol) -> None:
-    """Checks before an evaluation that `keep` can make an entry of the run.
-
-    Raises:
-        TsbenchError: the protocol cannot be ranked; the run is not finished, mixes files of several
-            runs, has changed constants or a damaged file; or the entry exists.
-    """
-    if not protocol.ranked:
-        raise TsbenchError(f"a score by protocol {protocol.name} cannot be an entry")
-    if PROTOCOLS.get(protocol.name) != protocol:
-        raise TsbenchError(
-            f"a score with another seed or other numbers than protocol {protocol.name} has "
-            "cannot be an entry"
-        )
-    missing = [path.name for path in run.essential if not path.exists()]
-    if missing:
-        raise TsbenchError(f"{run.path} is no finished run: it lacks {', '.join(missing)}")
-    policy, config, record = run.policy().info, run.config(), run.record()
-    task = run.task(policy.task)
-    if not (tasks.standard(task) and record.standard):
-        raise TsbenchError(f"{run.path} was made with changed constants: it cannot be an entry")
-    run.versions()
-    for what, said in (
-        ("task", (policy.task, record.task, config.task.name)),
-        ("version of the task", (policy.task_version, record.task_version)),
-        ("method", (policy.method, record.method, config.method["name"])),
-        ("seed", (record.seed, config.seed)),
-        ("budget", (record.budget, config.budget)),
-        ("policy", (policy.sha256, record.score.origin.policy)),
-    ):
-        if len(set(said)) > 1:
-            raise TsbenchError(f"{run.path} mixes several runs: its files disagree on the {what}")
-    run.plan(task)
-    run.reference(task)
-    run.roadmap(task)
-    check_new(entry, parents=True)
-
-
-def keep(run: RunDirectory, entry: Path, score: Score) -> None:
-    """Copies the files of an entry from a run into a new directory, with a new score.
-
-    Args:
-        run: a finished run.
-        entry: the new directory.
-        score: the score of the run's policy, with its action log.
-
-    Raises:
-        TsbenchError: as `check_keep`, or the directory cannot be written.
-    """
-    check_keep(run, entry, score.origin.protocol)
-    assert score.log is not None
-    content = replace(run.record(), score=score).as_dict()
-    kept = RunDirectory(entry)
-    with os_errors(entry):
-        entry.mkdir(parents=True)
-        for path in (*run.essential, *run.optional):
-            if path.exists() and path != run.score_file:
-                shutil.copy(path, entry / path.name)
-        score.log.save(kept.actions_file)
-    write_json(kept.score_file, content)
 
 
 def shown(record: Record) -> dict[str, Any]:

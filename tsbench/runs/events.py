@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from tensorboard.summary import Writer
 
 from tsbench.core.errors import TsbenchError
+from tsbench.runs.directory import read_metrics
 
 FILES = "events.out.tfevents.*"  # the file names of TensorBoard's writer
 _PLACE = ("stage", "steps", "seconds")  # keys of a row that are no figures
@@ -51,8 +51,11 @@ class Events:
         except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
             self._error = error
         try:
-            for line in metrics.read_text(encoding="utf-8").splitlines():
-                self.add(json.loads(line))
+            for row in read_metrics(metrics):
+                self.add(row)
+        except TsbenchError:
+            self.close()
+            raise
         except _DAMAGED as error:
             self.close()
             raise TsbenchError(f"damaged metrics {metrics}: {error}") from None

@@ -28,7 +28,7 @@ from tsbench.core.errors import (
     memory_errors,
     os_errors,
 )
-from tsbench.core.files import PART, taken, write_json, write_whole
+from tsbench.core.files import leftovers, taken, write_json, write_whole
 from tsbench.core.method import Problem
 from tsbench.core.policy import Policy
 from tsbench.core.typed import unknown_key
@@ -137,8 +137,9 @@ def resume(directory: Path, console: Console | None = None) -> Score:
         problem = prepare(config)
         check_provenance(run, config, problem)
         with _explained(run):
-            for path in directory.rglob(f"*{PART}"):
-                path.unlink(missing_ok=True)
+            for folder in (run.path, run.checkpoints):
+                for path, _ in leftovers(folder) if folder.is_dir() else ():
+                    path.unlink(missing_ok=True)
             line = f"tsbench run resume={directory}"
             return _work(config, problem, run, line, console or Console())
 
@@ -287,7 +288,8 @@ def _create(run: RunDirectory) -> None:
         TsbenchError: the directory holds a run or other files.
     """
     run.path.mkdir(parents=True, exist_ok=True)
-    left = {path.name.removesuffix(PART) for path in run.path.iterdir()}
+    parts = dict(leftovers(run.path))
+    left = {parts.get(path, path.name) for path in run.path.iterdir()}
     if left <= {run.versions_file.name, run.config_file.name} and not run.config_file.exists():
         return
     elsewhere = "choose another directory=PATH"

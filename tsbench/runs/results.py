@@ -27,7 +27,7 @@ import numpy as np
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
-from tsbench.core.files import PART, write_whole
+from tsbench.core.files import write_whole
 from tsbench.core.task import plannable
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
@@ -409,11 +409,14 @@ def _keep_policies(found: Results, group: Sequence[Result], policies: Path) -> N
             if run is not None and run.path == folder:
                 del found.folders[row.words]
         elif run is not None and run.path != folder:
-            part = folder.with_name(folder.name + PART)
+            part = folder.with_name(f"{folder.name}.part")
             shutil.rmtree(part, ignore_errors=True)
             part.mkdir(parents=True)
-            for path in (*run.essential, run.plan_file):
-                if path.exists() and path != run.score_file:
+            for path in (
+                run.config_file, run.versions_file, run.policy_info_file, run.policy_file,
+                run.plan_file,
+            ):  # fmt: skip
+                if path.exists():
                     shutil.copy(path, part / path.name)
             shutil.rmtree(folder, ignore_errors=True)
             part.rename(folder)

@@ -16,11 +16,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from tsbench.core.errors import Stopped, TsbenchError
+from tsbench.core.files import append, read_file
 from tsbench.core.method import Monitor, Snapshot
 from tsbench.core.typed import typed
 from tsbench.core.words import duration, number
 from tsbench.runs.checkpoint import Checkpoint, Checkpoints
-from tsbench.runs.directory import CHECKPOINTS, EVENTS, LOG, METRICS, Stage
+from tsbench.runs.directory import CHECKPOINTS, EVENTS, LOG, MAX_METRICS, METRICS, Stage
 from tsbench.runs.events import Events
 
 INTERVAL = 30.0  # seconds of training between checkpoints
@@ -150,10 +151,10 @@ class RunWorkspace:
         self._stopped_by: int | None = None  # a signal that has arrived
         self._learning = False  # whether there is an iteration to finish and a state to save
         with ExitStack() as files:
-            self._log = files.enter_context((directory / LOG).open("a", encoding="utf-8"))
+            self._log = files.enter_context(append(directory / LOG))
             self._checkpoints = Checkpoints(directory / CHECKPOINTS, self.note)
             self._number, self._saved = self._newest()
-            self._metrics = files.enter_context((directory / METRICS).open("ab"))
+            self._metrics = files.enter_context(append(directory / METRICS))
             self._rewind()
             self._events = Events(directory / EVENTS, directory / METRICS, self.note)
             files.callback(self._events.close)
@@ -174,7 +175,7 @@ class RunWorkspace:
         path, size = self.directory / METRICS, self._saved.sizes[METRICS] if self._saved else 0
         if self._metrics.tell() < size:
             raise TsbenchError(f"{path} has been cut since the last checkpoint")
-        lost = path.read_bytes()[size:].count(b"\n")
+        lost = read_file(path, MAX_METRICS, "metrics")[size:].count(b"\n")
         self._metrics.truncate(size)
         self._metrics.seek(0, os.SEEK_END)
         if self._saved:
@@ -189,7 +190,7 @@ class RunWorkspace:
     def note(self, line: str) -> None:
         """Shows the user a line, and adds it to the log."""
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
-        self._log.write(f"{time.perf_counter() - self._began:10.1f} s  {line}\n")
+        self._log.write(f"{time.perf_counter() - self._began:10.1f} s  {line}\n".encode())
         self._log.flush()
 
     def stop(self, signal: int) -> None:

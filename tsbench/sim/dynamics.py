@@ -103,7 +103,7 @@ def expect_finite(
     """
     looked_at: dict[str, np.ndarray] = {"action": action}
     if state is not None and reward is not None:
-        looked_at = {**vars(state), "reward": reward}
+        looked_at |= {**vars(state), "reward": reward}
     for name, values in looked_at.items():
         if np.isfinite(values).all():
             continue

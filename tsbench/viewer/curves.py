@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_new
+from tsbench.runs.directory import read_metrics
 
 MEASURE = "episode_return"
+LARGEST = 1e15  # figures that matplotlib draws without an overflow
+MOST_STAGES = 16
 
 
 def figure(metrics: Path) -> Figure | None:
@@ -26,23 +29,26 @@ def figure(metrics: Path) -> Figure | None:
     Raises:
         TsbenchError: the file is damaged.
     """
-    curves: dict[str, tuple[list[int], list[float]]] = {}
-    for line in metrics.read_text(encoding="utf-8").splitlines():
-        try:
-            row = json.loads(line)
-            if MEASURE in row:
-                steps, returns = curves.setdefault(row["stage"], ([], []))
-                steps.append(row["steps"])
-                returns.append(row[MEASURE])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise TsbenchError(f"damaged metrics {metrics}: {error}") from None
+    curves: dict[str, tuple[list[Any], list[Any]]] = {}
+    for row in read_metrics(metrics):
+        if MEASURE not in row:
+            continue
+        stage, point = row.get("stage"), [row.get("steps"), row[MEASURE]]
+        numbers = all(isinstance(one, (int, float)) and abs(one) < LARGEST for one in point)
+        if not (isinstance(stage, str) and numbers):
+            raise TsbenchError(f"damaged metrics {metrics}: a row lacks its stage, steps or return")
+        for values, one in zip(curves.setdefault(stage, ([], [])), point, strict=True):
+            values.append(one)
+        if len(curves) > MOST_STAGES:
+            raise TsbenchError(f"damaged metrics {metrics}: more than {MOST_STAGES} stages")
     if not curves:
         return None
     drawn = Figure(figsize=(4.5 * len(curves), 3.2), layout="constrained")
     panels = drawn.subplots(1, len(curves), squeeze=False)[0]
     for panel, (stage, (steps, returns)) in zip(panels, curves.items(), strict=True):
         panel.plot(steps, returns)
-        panel.set(title=stage, xlabel="environment steps", ylabel="episode return of the stage")
+        panel.set_title(stage[:40], parse_math=False)
+        panel.set(xlabel="environment steps", ylabel="episode return of the stage")
         panel.grid(alpha=0.3)
     return drawn
 

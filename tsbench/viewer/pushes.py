@@ -13,7 +13,7 @@ from tsbench.core.task import Plant
 from tsbench.sim.push import Push, direction
 
 DURATION = 0.1  # s, of every push, as in the protocol
-_NUMBER = r"\d+(?:\.\d+)?"
+_NUMBER = r"\d{1,6}(?:\.\d{1,12})?"
 _GRAMMAR = re.compile(rf"({_NUMBER})N@({_NUMBER})s:([+-][xyz]|[+-]?{_NUMBER})")
 
 

@@ -75,6 +75,7 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
     subject = run_subject(run)
     assert subject.policy is not None
     assert subject.score is not None
+    learning = charts.learning(run.metrics_file) if run.has_metrics else None
     plan, recording = subject.plan(), record_episode(subject.task, subject.policy)
     view = page.render(subject.show_of(recording, plan))
     report = page.fill(
@@ -85,7 +86,7 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
             "executed": page.css(EXECUTED_COLOUR),
             "answers": "".join(_answers(subject, recording, plan)),
             "view": html.escape(view),
-            "sections": "".join(_sections(subject, run, recording, plan)),
+            "sections": "".join(_sections(subject, run, recording, plan, learning)),
         },
     )
     return view, report
@@ -133,7 +134,11 @@ def worth_in_words(score: Score, task: Task[Any]) -> str:
 
 
 def _sections(
-    subject: Subject, run: RunDirectory, recording: Recording, plan: Recording | None
+    subject: Subject,
+    run: RunDirectory,
+    recording: Recording,
+    plan: Recording | None,
+    learning: str | None,
 ) -> Iterator[str]:
     assert subject.score is not None
     duration = max(r.duration for r in (recording, plan) if r is not None)
@@ -165,8 +170,7 @@ def _sections(
         "the task solved.",
         charts.robustness(subject.score.score.robustness.surface, subject.task.timestep),
     )
-    metrics = run.metrics_file
-    if learning := charts.learning(metrics) if metrics.exists() else None:
+    if learning:
         yield _section(
             "How it learned",
             "The return of training episodes. Each stage has its own reward.",

@@ -1,0 +1,126 @@
+"""The board as tables and as a site."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tsbench.cli import verbs as cli
+from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.protocol import V1
+from tsbench.leaderboard import page, submission, verify
+from tsbench.leaderboard.submission import Described
+
+BOARD = Path(__file__).parents[2] / "leaderboards"
+RUN = min(BOARD.glob("v1/*/*/seed*"), key=lambda run: (run / "actions.npz").stat().st_size)
+TASK = json.loads((RUN / "score.json").read_text())["task"]
+EVIL = "<script>alert(1)</script>"
+
+
+def add(board: Path, name: str, runs: list[Path], hardware: str = "a PC") -> Path:
+    url = "https://example.org/?a=1&b='\"><b>"
+    described = Described(name, (EVIL,), "MIT", url, hardware, tuning_trials=7)
+    packed = submission.pack(runs, described, board, V1, score=evaluate)
+    return submission.place(packed, board, V1, [])
+
+
+def of_seed(folder: Path, seed: int) -> Path:
+    """A copy of the kept run that says it is of another seed."""
+    run = folder / f"run{seed}"
+    shutil.copytree(RUN, run)
+    score = json.loads((run / "score.json").read_text())
+    before, score["seed"] = score["seed"], seed
+    (run / "score.json").write_text(json.dumps(score))
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace(f"\nseed: {before}", f"\nseed: {seed}"))
+    return run
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("board")
+    add(folder, "one", [RUN])
+    add(folder, "ten", [of_seed(folder.parent, seed) for seed in range(10)], EVIL)
+    taken_back = add(folder, "gone", [RUN])
+    verify.record(folder, taken_back, verify.retracted(taken_back, "a bug"))
+    checked = verify.verify(folder / "v1" / TASK / "one", verify.Asked(rescore=False))
+    verify.record(folder, folder / "v1" / TASK / "one", replace(checked, state="re-scored"))
+    return folder
+
+
+def test_rows_are_sorted_and_say_how_sure_they_are(board: Path) -> None:
+    tables, left_out = page.tables(board)
+    (table,) = (table for table in tables if table.rows)
+    rows = {row.name: row for row in table.rows}
+    assert set(rows) == {"one", "ten"}
+    claimed = rows["one"].entry.kept[0].training.claimed
+    assert rows["one"].reward.iqm == claimed.solved_reward
+    assert rows["one"].reward.interval is None
+    assert "too few" in rows["one"].standing
+    low, high = rows["ten"].reward.interval or (0.0, 0.0)
+    assert low == pytest.approx(high)  # ten equal trainings
+    assert low == pytest.approx(claimed.solved_reward)
+    assert rows["one"].share == claimed.solved_reward / max(table.best, claimed.solved_reward)
+    assert rows["one"].state == "re-scored"
+    assert rows["ten"].state == "submitted"
+    assert left_out == [f"v1/{TASK}/gone: retracted: a bug"]
+    assert {"zero", "random"} <= set(table.references)
+
+
+def test_tables_in_markdown(board: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["leaderboard", "--board", str(board), "--readme"]) == 0
+    capsys.readouterr()
+    text = (board / "README.md").read_text()
+    assert text.startswith("# Leaderboards\n")
+    assert re.search(r"\| one \| [0-9.]+ \| \d+% \|.*\| re-scored \| 7 \| 1 \|", text)
+    assert "retracted: a bug" in text
+    assert cli.main(["leaderboard", "--board", str(board), "--readme"]) == 0
+    assert (board / "README.md").read_text() == text
+
+
+@pytest.fixture(scope="module")
+def site(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    page.write_site(board, folder, lambda run: f"<p>{run.path.name}</p>", lambda line: None)
+    return folder
+
+
+def test_texts_of_an_entry_are_nothing_but_text(site: Path) -> None:
+    for path in site.rglob("index.html"):
+        text = path.read_text()
+        assert EVIL not in text
+        assert "'\"><b>" not in text
+        assert "default-src 'none'" in text
+        assert not re.search(r"(src=|@import|url\()", text)
+    own = (site / TASK / "ten" / "index.html").read_text()
+    assert "&lt;script&gt;alert(1)" in own
+    assert 'href="seed3.html"' in own
+    assert (site / TASK / "ten" / "seed3.html").read_text() == "<p>seed3</p>"
+    manifest = (site / TASK / "ten" / "manifest.json").read_bytes()
+    assert submission.Manifest.decode(manifest).described.entry == "ten"
+
+
+@pytest.mark.parametrize("width", [1280, 500])
+def test_nothing_runs_off_the_screen(site: Path, width: int, tmp_path: Path) -> None:
+    """500 px are the narrowest window that Chromium opens."""
+    browser = shutil.which("chromium")
+    if browser is None:
+        pytest.skip("Chromium is not installed")
+    measure = "document.body.dataset.over = document.scrollingElement.scrollWidth - innerWidth"
+    for path in sorted(site.rglob("index.html")):
+        copy = tmp_path / "page.html"
+        copy.write_text(path.read_text().replace("</body>", f"<script>{measure}</script></body>"))
+        done = subprocess.run(
+            [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+             f"--window-size={width},900", "--dump-dom", copy.as_uri()],
+            capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        over = re.search(r'data-over="(-?\d+)"', done.stdout)
+        assert over is not None, done.stderr
+        assert int(over[1]) <= 0, path

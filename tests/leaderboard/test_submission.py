@@ -1,0 +1,542 @@
+"""Entries made from runs, what the verifier finds out about them, and pull requests."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+from tsbench import tasks
+from tsbench.cli import verbs as cli
+from tsbench.core.errors import TsbenchError
+from tsbench.core.motion import Plan
+from tsbench.evaluation import protocol as protocols
+from tsbench.evaluation.evaluate import evaluate
+from tsbench.evaluation.protocol import PROTOCOLS, SMOKE, V1
+from tsbench.evaluation.replay import contradictions, differences
+from tsbench.leaderboard import submission, verify
+from tsbench.leaderboard.submission import Described, Manifest
+from tsbench.runs import config, execute
+from tsbench.runs.directory import RunDirectory
+
+BOARD = Path(__file__).parents[2] / "leaderboards"
+KEPT = sorted(path.parent for path in BOARD.glob("v1/*/*/manifest.json"))
+WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512", "seed=3"]
+WHO = ["--author", "A. Person", "--licence", "MIT", "--board", "board"]
+TOLD = ["--seeds", "5", "--steps", "256", "--seconds", "1.5", "--command", "python train.py"]
+QUICK = replace(SMOKE, name="quick", ranked=True)
+
+
+@pytest.fixture(autouse=True)
+def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A protocol that takes seconds, and by whose scores entries are made."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PROTOCOLS, "quick", QUICK)
+    monkeypatch.setattr(protocols, "V1", QUICK)
+
+
+def trained(directory: Path, words: list[str]) -> Path:
+    """A finished run whose score is by the quick protocol."""
+    chosen = replace(config.compose(words), directory=str(directory))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(execute, "SMOKE", replace(QUICK, name="quick"))
+        patch.setattr(execute, "V1", QUICK)
+        execute.execute(chosen, words, Console(quiet=True))
+    return directory
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run, which no test may change."""
+    return trained(tmp_path_factory.mktemp("runs") / "one", WORDS)
+
+
+@pytest.fixture
+def finished(shown: Path) -> Path:
+    """A copy of the finished run, which tests may change."""
+    shutil.copytree(shown, "one")
+    return Path("one")
+
+
+def seeded(run: Path, seed: int) -> Path:
+    """A copy of the run that says it is of another seed."""
+    other = Path(f"seed{seed}")
+    shutil.copytree(run, other)
+    other_config(other, "\nseed: 3", f"\nseed: {seed}")
+    other_score(other, "seed", value=seed)
+    return other
+
+
+def other_score(run: Path, *path: str, value: Any) -> None:
+    content = json.loads((run / "score.json").read_text())
+    inner = content
+    for name in path[:-1]:
+        inner = inner[name]
+    inner[path[-1]] = value
+    (run / "score.json").write_text(json.dumps(content))
+
+
+def other_config(run: Path, before: str, after: str) -> None:
+    text = (run / "config.yaml").read_text()
+    assert before in text
+    (run / "config.yaml").write_text(text.replace(before, after))
+
+
+def submit(*words: str) -> int:
+    return cli.main(["submit", *words, "--name", "mine", *WHO])
+
+
+ENTRY = Path("board/quick/rocket_navigation/mine")
+
+
+def test_runs_become_an_entry(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    second = seeded(finished, 4)
+    assert submit("one", str(second), "--trained", "3-5", "--hardware", "two cores") == 0
+    shown = capsys.readouterr().out
+    assert str(ENTRY) in shown
+    assert "not said: tuning trials" in shown
+    assert "not said: hardware" not in shown
+    assert "not kept: the trainings with seeds 5" in shown
+    entry = submission.read_entry(ENTRY)
+    assert [kept.training.seed for kept in entry.kept] == [3, 4]
+    files = {"actions.npz", "config.yaml", "plan.npz", "policy.json", "policy.safetensors",
+             "reference.npz", "score.json", "versions.json"}  # fmt: skip
+    assert {path.name for path in (ENTRY / "seed3").iterdir()} == files
+    for name in files:
+        assert (ENTRY / "seed3" / name).read_bytes() == (finished / name).read_bytes()
+    training = entry.kept[0].training
+    record = RunDirectory(finished).record()
+    assert training.command == f"tsbench run {' '.join(WORDS)}"
+    assert training.steps == sum(stage.steps for stage in record.stages)
+    assert training.claimed.solved_reward == record.score.solved_reward
+    assert training.versions["mujoco"] == RunDirectory(finished).versions()["packages"]["mujoco"]
+    manifest = entry.manifest
+    assert Manifest.decode((ENTRY / "manifest.json").read_bytes()) == manifest
+    digest = hashlib.sha256((finished / "plan.npz").read_bytes()).hexdigest()
+    assert manifest.files["seed3/plan.npz"].sha256 == digest
+    assert [path.name for path in Path("board").iterdir()] == ["quick"]  # nothing half-made
+    assert submit("one") == 2
+    assert "exists and nothing is overwritten" in capsys.readouterr().err
+
+
+def test_an_entry_is_verified_in_full_and_the_verdict_kept(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert submit("one") == 0
+    assert cli.main(["verify", "--all", "--board", "board", "--record", "--json", "out.json"]) == 0
+    assert "re-scored: seed3 was compared bit for bit: equal" in capsys.readouterr().out
+    (verdict,) = json.loads(Path("out.json").read_text())["verdicts"]
+    assert (verdict["entry"], verdict["state"]) == ("quick/rocket_navigation/mine", "re-scored")
+    for figure in verdict["figures"]:
+        assert figure["verified"] == figure["claimed"]
+    kept = verify.recorded(Path("board"), ENTRY)
+    assert kept is not None
+    assert kept.state == "re-scored"
+    assert cli.main(["verify", str(ENTRY), "--board", "board", "--retract", "a bug"]) == 0
+    kept = verify.recorded(Path("board"), ENTRY)
+    assert kept is not None
+    assert (kept.state, kept.reasons) == ("retracted", ("retracted: a bug",))
+    # Another entry under that name has no verdict yet.
+    shutil.rmtree(ENTRY)
+    assert submit("one", "--hardware", "another") == 0
+    assert verify.recorded(Path("board"), ENTRY) is None
+
+
+def test_a_check_keeps_nothing(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert submit("one", "--check") == 0
+    assert "re-scored: seed3 was compared bit for bit" in capsys.readouterr().out
+    assert not list(Path("board").iterdir())
+
+
+def test_kept_runs_get_a_manifest_where_they_are(finished: Path) -> None:
+    ENTRY.mkdir(parents=True)
+    for path in finished.iterdir():
+        if path.name in submission.LIMITS:
+            (ENTRY / "seed3").mkdir(exist_ok=True)
+            shutil.copy(path, ENTRY / "seed3")
+    before = {path: path.stat().st_mtime_ns for path in (ENTRY / "seed3").iterdir()}
+    assert submit(str(ENTRY / "seed3")) == 0
+    assert {path: path.stat().st_mtime_ns for path in (ENTRY / "seed3").iterdir()} == before
+    assert submission.read_entry(ENTRY).manifest.method == "twostage"
+
+
+def test_a_score_by_another_protocol_is_made_again(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And so is every score, if asked."""
+    content = json.loads((finished / "score.json").read_text())
+    content["score"]["protocol"] = content["score"]["origin"]["protocol"]["name"] = "smoke"
+    content["score"]["nominal"]["normalized_reward"] = 0.99
+    (finished / "score.json").write_text(json.dumps(content))
+    assert submit("one") == 0
+    score = submission.read_entry(ENTRY).kept[0].record.score
+    assert score.protocol == "quick"
+    assert score.nominal.normalized_reward != 0.99
+    shutil.rmtree("board")
+    other_score(finished, "score", "nominal", "normalized_reward", value=0.99)
+    assert submit("one", "--rescore") == 0
+    assert submission.read_entry(ENTRY).kept[0].record.score == score
+
+
+def plan_of_another_task(run: Path) -> None:
+    plan = Plan.load(run / "plan.npz")
+    replace(plan, task="rocket_obstacles").save(run / "plan.npz")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "line"),
+    [
+        (lambda run: (run / "reference.npz").write_bytes(b"PK"), "damaged"),
+        (plan_of_another_task, "rocket_obstacles"),
+        (lambda run: other_score(run, "task", value="laikago_trot"), "disagree on the task"),
+        (lambda run: other_score(run, "method", value="mine"), "disagree on the method"),
+        (
+            lambda run: other_config(run, "name: twostage", "name: monolithic"),
+            "disagree on the method",
+        ),
+        (
+            lambda run: other_score(run, "task_version", value=7),
+            "disagree on the version of the task",
+        ),
+        (lambda run: other_config(run, "seed: 3", "seed: 4"), "disagree on the seed"),
+        (lambda run: other_score(run, "budget", value="fast"), "disagree on the budget"),
+        (
+            lambda run: other_score(run, "score", "origin", "policy", value="0" * 64),
+            "mixes several runs: its files disagree on the policy",
+        ),
+        (lambda run: other_score(run, "standard", value=False), "changed constants"),
+        (lambda run: (run / "versions.json").write_text("hi"), "damaged versions"),
+        (
+            lambda run: other_score(run, "score", "origin", "protocol", "seed", value=1),
+            "another seed or other numbers than protocol quick",
+        ),
+        (
+            lambda run: other_score(run, "score", "origin", "protocol", "perturbed", value=9),
+            "another seed or other numbers than protocol quick",
+        ),
+        (
+            lambda run: other_score(run, "score", "robustness", "survival_100N", value=0.123),
+            "contradicts itself: survival_100N is not that of the surface",
+        ),
+        (lambda run: (run / "actions.npz").unlink(), "files lacks seed3/actions.npz"),
+        (lambda run: (run / "policy.json").unlink(), "an action log alone is no entry"),
+        (lambda run: (run / "score.json").unlink(), "say --seeds, --steps, --seconds"),
+    ],
+)
+def test_what_does_not_belong_together_is_no_entry(
+    finished: Path,
+    capsys: pytest.CaptureFixture[str],
+    spoil: Callable[[Path], object],
+    line: str,
+) -> None:
+    spoil(finished)
+    assert submit("one") == 2
+    error = capsys.readouterr().err
+    assert line in error
+    assert error.count("\n") == 1
+    assert not list(Path("board").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--name", "../up"], "entry must be a name of"),
+        (["--name", "mine", "--url", "javascript:x"], "url must begin with https://"),
+        (["--name", "mine", "--author", "x\ny"], "authors must be one line"),
+        (["--name", "mine", "--trained", "4"], "seeds_trained lacks the kept seed 3"),
+        (["--name", "mine", "--trained", "4-2"], "must be a whole number from 4"),
+    ],
+)
+def test_what_authors_say_is_checked(
+    finished: Path, capsys: pytest.CaptureFixture[str], words: list[str], line: str
+) -> None:
+    assert cli.main(["submit", "one", *WHO, *words]) == 2
+    assert line in capsys.readouterr().err
+
+
+def test_runs_of_several_kinds_are_no_entry(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert submit("one", "one") == 2
+    assert "two of the runs have the same seed" in capsys.readouterr().err
+    second = seeded(finished, 4)
+    other_score(second, "budget", value="fast")
+    assert submit("one", str(second)) == 2
+    assert "more than one budget: fast, smoke" in capsys.readouterr().err
+
+
+def test_a_claim_that_the_policy_does_not_earn(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Figures that fit each other pass the first tiers, and not the second."""
+    content = json.loads((finished / "score.json").read_text())
+    score = content["score"]
+    task = tasks.make(content["task"])
+    perturbed = score["perturbed"]
+    for name in ("normalized_reward", "solved_reward"):
+        factor = 1.25 if perturbed[name] else 0.0
+        score[name] = perturbed[name] = perturbed[name] * factor
+    score["against_plan"] *= 1.25
+    (finished / "score.json").write_text(json.dumps(content))
+    assert not contradictions(RunDirectory(finished).record().score, task)
+    assert submit("one") == 0
+    assert cli.main(["verify", str(ENTRY), "--quick"]) == 0
+    assert cli.main(["verify", str(ENTRY), "--comment", "comment.md"]) == 1
+    said = capsys.readouterr().out
+    assert "FAILED: not re-scored: seed3 was compared bit for bit: DIFFERENT" in said
+    assert "normalized_reward: claimed" in said
+    assert "replayed, **failed**" in Path("comment.md").read_text()
+
+
+def test_on_another_machine_every_field_is_compared(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A submitter who names another machine gets no laxer comparison than its tolerance."""
+    record = RunDirectory(finished).record()
+    task, score = tasks.make(record.task), record.score
+    surface = score.robustness.surface
+    most = tuple(tuple(tuple(1 for _ in row) for row in plane) for plane in surface.survived)
+    forged = replace(
+        score, robustness=replace(score.robustness, surface=replace(surface, survived=most))
+    )
+    assert contradictions(forged, task)
+    assert any("of the pushes" in line for line in differences(forged, score, 1.0))
+    longer = replace(score, perturbed=replace(score.perturbed, steps=score.perturbed.steps * 2))
+    assert any("perturbed: steps" in line for line in differences(longer, score, 1.0))
+    other_score(finished, "score", "origin", "machine", "extensions", value="X86_V9")
+    assert submit("one") == 0
+    assert cli.main(["verify", str(ENTRY)]) == 0
+    assert "compared within 0.05 (extensions X86_V9 there" in capsys.readouterr().out
+
+
+def test_another_mujoco_is_not_verified(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other_score(finished, "score", "origin", "packages", "mujoco", value="2.0")
+    assert submit("one") == 1
+    assert "FAILED: not replayed: seed3 was made with another mujoco" in capsys.readouterr().out
+    assert not ENTRY.exists()
+
+
+def test_the_hidden_seed(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert submit("one") == 0
+    Path("seed.txt").write_text("0123456789abcdef" * 4 + "\n")
+    words = ["verify", str(ENTRY), "--board", "board", "--seed-file", "seed.txt"]
+    assert cli.main(words) == 2
+    assert "no published hash of a seed board/hidden-seed.sha256" in capsys.readouterr().err
+    digest = hashlib.sha256(Path("seed.txt").read_bytes()).hexdigest()
+    Path("board/hidden-seed.sha256").write_text(f"{digest}  seed.txt\n")
+    assert cli.main([*words, "--json", "out.json"]) == 0
+    (verdict,) = json.loads(Path("out.json").read_text())["verdicts"]
+    assert verdict["state"] == "hidden-seed"
+    assert "0123456789abcdef" not in Path("out.json").read_text()
+    hidden = [one for one in verdict["figures"] if "hidden" in one["name"]]
+    assert len(hidden) == 1
+    Path("seed.txt").write_text("ffffffffffffffff" * 4)
+    assert cli.main(words) == 2
+    assert "seed.txt is not the seed whose hash is published" in capsys.readouterr().err
+
+
+def test_a_score_that_hangs_on_a_lucky_seed_shows(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two standard errors and a half of the difference are chance, more is not: by hand, 100
+    episodes of variance 0.04 each, so 2.576 x sqrt(0.08 / 100) = 0.0729."""
+    assert submit("one") == 0
+    entry = submission.read_entry(ENTRY)
+    deviations = np.resize([0.2, -0.2], 100) * np.sqrt(0.99)  # of variance 0.04 with ddof=1
+    for drop, holds in ((0.07, True), (0.075, False)):
+        claimed = entry.kept[0].training.claimed.solved_reward
+        rewards = iter([claimed + deviations, claimed - drop + deviations])
+        monkeypatch.setattr(verify, "solved_rewards", lambda *_, of=rewards: next(of))
+        verdict = verify.verify(ENTRY, verify.Asked(rescore=False, hidden=1))
+        assert verdict.passed is holds, verdict.reasons
+
+
+def test_training_again(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert submit("one") == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(execute, "SMOKE", QUICK)
+        assert cli.main(["verify", str(ENTRY), "--retrain"]) == 0
+    assert "re-trained: seed3 was trained again to the same bits" in capsys.readouterr().out
+
+
+def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]) -> None:
+    """A method without a plan gives an entry, and the pages can be made from that entry."""
+    words = ["task=rocket_navigation", "method=monolithic", "budget=smoke"]
+    trained(Path("one").absolute(), [*words, "task.budgets.smoke.act=512"])
+    assert submit("one") == 0
+    assert {path.name for path in (ENTRY / "seed0").iterdir()} == {
+        "actions.npz", "config.yaml", "policy.json", "policy.safetensors", "score.json",
+        "versions.json",
+    }  # fmt: skip
+    run = str(ENTRY / "seed0")
+    assert cli.main(["view", run, "--html", "entry.html"]) == 0
+    assert cli.main(["report", run, "--html", "report.html"]) == 0
+    assert "without a plan" in Path("report.html").read_text()
+
+
+def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
+    """200 random bytes, over all files of an entry."""
+    rng = np.random.default_rng(0)
+    runs = [path.parent for path in BOARD.glob("v1/*/*/*/score.json")]
+    run = min(runs, key=lambda run: sum(file.stat().st_size for file in run.iterdir()))
+    described = Described("mine", ("A. Person",), "MIT")
+    packed = submission.pack([run], described, tmp_path, V1, score=evaluate)
+    files = sorted(path for path in packed.rglob("*") if path.is_file())
+    submission.read_entry(packed)
+    noticed = set()
+    for number in range(200):
+        file = files[number % len(files)]
+        content = file.read_bytes()
+        place = int(rng.integers(len(content)))
+        changed = bytearray(content)
+        changed[place] ^= int(rng.integers(1, 256))
+        file.write_bytes(changed)
+        with pytest.raises(TsbenchError, match=file.name):
+            submission.read_entry(packed)
+        noticed.add(number)
+        file.write_bytes(content)
+    assert len(noticed) == 200
+
+
+@pytest.mark.parametrize("entry", KEPT, ids=[f"{one.parent.name}-{one.name}" for one in KEPT])
+def test_the_entries_of_the_repository(entry: Path) -> None:
+    verdict = verify.verify(entry, verify.Asked(rescore=False, threads=1))
+    assert verdict.passed, verdict.reasons
+
+
+# Pull requests
+
+
+def git(*words: str) -> str:
+    identity = ["-c", "user.name=A", "-c", "user.email=a@example.org"]
+    done = subprocess.run(["git", "-C", "repo", *identity, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.fixture
+def repository(finished: Path) -> str:
+    """A repository with one file in main, a submission in HEAD; the commit of main."""
+    Path("repo").mkdir()
+    git("init", "-q", "-b", "main")
+    Path("repo/README.md").write_text("hello\n")
+    git("add", "-A")
+    git("commit", "-q", "-m", "main")
+    base = git("rev-parse", "HEAD")
+    git("checkout", "-q", "-b", "entry")
+    board = "repo/leaderboards"
+    who = [word.replace("board", board) if word == "board" else word for word in WHO]
+    assert cli.main(["submit", "one", "--name", "mine", *who]) == 0
+    shutil.move("repo/leaderboards/quick", "repo/leaderboards/v1")
+    git("add", "-A")
+    git("commit", "-q", "-m", "entry")
+    return base
+
+
+def link(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/etc/hostname")
+
+
+def check(base: str) -> int:
+    Path("comment.md").unlink(missing_ok=True)
+    return cli.main(["verify", "--pull-request", base, "--in", "repo", "--comment", "comment.md"])
+
+
+def test_a_pull_request_that_is_a_submission(
+    repository: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert check(repository) == 0
+    comment = Path("comment.md").read_text()
+    assert "| seed | figure | claimed | verified | difference |" in comment
+    assert "| 3 | solved_reward |" in comment
+    assert "re-scored, passed" in comment
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda: Path("repo/README.md").write_text("bye\n"), "'README.md' is changed"),
+        (lambda: Path("repo/README.md").unlink(), "'README.md' is changed"),
+        (lambda: Path("repo/setup.py").write_text("x"), "'setup.py' is no file of an entry"),
+        (
+            lambda: Path("repo/leaderboards/v1/rocket_navigation/mine/seed3/run.py").touch(),
+            "run.py' is no file of an entry",
+        ),
+        (
+            lambda: Path("repo/leaderboards/v1/rocket_navigation/mine/.gitattributes").touch(),
+            ".gitattributes' is no file of an entry",
+        ),
+        (
+            lambda: link(Path("repo/leaderboards/v1/rocket_navigation/mine/manifest.json")),
+            "has mode 120000",
+        ),
+        (
+            lambda: Path("repo/leaderboards/v1/rocket_navigation/mine/manifest.json").chmod(0o755),
+            "has mode 100755",
+        ),
+    ],
+)
+def test_a_pull_request_that_changes_something_else(
+    repository: str, change: Callable[[], object], fault: str
+) -> None:
+    change()
+    git("add", "-A")
+    git("commit", "-q", "-m", "more")
+    assert check(repository) == 1
+    comment = Path("comment.md").read_text()
+    assert "Not verified" in comment
+    assert fault.replace("'", "&#39;") in comment
+
+
+def test_the_script_of_the_workflow(repository: str) -> None:
+    """As the workflow calls it, on an entry of the repository's own."""
+    run = min(BOARD.glob("v1/*/*/seed*"), key=lambda run: (run / "actions.npz").stat().st_size)
+    described = Described("theirs", ("A. Person",), "MIT")
+    board = Path("repo/leaderboards").absolute()
+    submission.place(submission.pack([run], described, board, V1, score=evaluate), board, V1, [])
+    git("checkout", "-q", "-b", "theirs", repository)
+    git("add", str(board / "v1" / RunDirectory(run).record().task / "theirs"))
+    git("commit", "-q", "-m", "theirs")
+    script = BOARD.parent / ".ci" / "verify_submission"
+    done = subprocess.run(
+        [script, "repo", repository, "comment.md", "--quick", "--threads", "1"],
+        env={**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(BOARD.parent)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "theirs: replayed, passed" in Path("comment.md").read_text()
+
+
+def test_the_workflow_that_sees_a_submission_has_no_rights() -> None:
+    folder = BOARD.parent / ".github" / "workflows"
+    verifies = yaml.safe_load((folder / "submission.yml").read_text())
+    assert verifies["permissions"] == {"contents": "read"}
+    assert "pull_request" in verifies[True]  # YAML reads the key `on` as true
+    text = (folder / "submission.yml").read_text()
+    assert "${{ secrets" not in text
+    assert "pull_request_target" not in text
+    comments = yaml.safe_load((folder / "submission-comment.yml").read_text())
+    assert comments[True]["workflow_run"]["workflows"] == [verifies["name"]]
+    assert not any("uses" in step for step in comments["jobs"]["comment"]["steps"])
+
+
+def test_a_comment_is_nothing_but_text() -> None:
+    reason = "@everyone <img src=x> [a](javascript:b) | `c` **d**\n# e"
+    verdict = verify.Verdict("v1/a/b", "", "", False, (reason,), (), 1.0)
+    last = verify.comment([verdict], []).splitlines()[-1]
+    assert last.startswith("- ")
+    assert not set(last[2:]) & set("@<>[]|`*!")

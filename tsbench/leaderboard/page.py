@@ -1,0 +1,279 @@
+"""The board as people read it: a static site without any network, and tables in Markdown.
+
+Every text from an entry passes through jinja2's escaping, and every page forbids the browser to
+load anything from elsewhere.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from tsbench import tasks
+from tsbench.core.errors import TsbenchError, os_errors
+from tsbench.core.files import write_whole
+from tsbench.core.words import duration, number
+from tsbench.evaluation.protocol import V1
+from tsbench.evaluation.references import stored
+from tsbench.evaluation.statistics import Aggregate, aggregate
+from tsbench.evaluation.words import FIGURES
+from tsbench.leaderboard.submission import MANIFEST, Entry, read_entry
+from tsbench.leaderboard.verify import RETRACTED, STATES, as_markdown, entries, recorded
+from tsbench.runs.directory import RunDirectory
+
+Report = Callable[[RunDirectory], str]  # makes the page of a training: 3-D view and figures
+
+STANDINGS = {
+    "ranked": "with a 95 % interval",
+    "provisional": "provisional: dots without an interval",
+    "too few": "too few for an interval",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """An entry as the tables show it; figures are means over its trainings.
+
+    Attributes:
+        entry: the entry.
+        state: what the board says of it.
+        reasons: why.
+        reward: solved_reward over the training seeds.
+        share: of the best reward that the board or a plan has.
+        figures: by name: normalized_reward, success, survival and recovery, and the first measure.
+        cost: environment steps, physics steps and seconds of one training.
+        surface: share of pushes survived, by force and heading, shape (forces, headings).
+        forces: of the surface in newtons.
+    """
+
+    entry: Entry
+    state: str
+    reasons: tuple[str, ...]
+    reward: Aggregate
+    share: float
+    figures: dict[str, float | None]
+    cost: tuple[float, float, float]
+    surface: np.ndarray
+    forces: tuple[float, ...]
+
+    @property
+    def name(self) -> str:
+        return self.entry.manifest.described.entry
+
+    @property
+    def complete(self) -> bool:
+        """Whether all trainings are kept."""
+        manifest = self.entry.manifest
+        return len(manifest.described.seeds_trained) == len(manifest.trainings)
+
+    @property
+    def standing(self) -> str:
+        """How sure the reward is, in words."""
+        words = STANDINGS[self.reward.standing]
+        return words if self.complete else f"not all that were trained; {words}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A task's rows, best first, and the reference policies beside them.
+
+    Attributes:
+        task: name of the task.
+        best: of `Task.ideal`, the best plan: its solved_reward.
+        measure: name of the measure that a column shows, and what it says.
+        rows: the entries.
+        references: rows of the policies that need no training, by name.
+    """
+
+    task: str
+    best: float
+    measure: tuple[str, str]
+    rows: tuple[Row, ...]
+    references: dict[str, dict[str, Any]]
+
+    @property
+    def most(self) -> float:
+        """The largest solved_reward, for bars."""
+        return max([self.best, *(max(row.reward.scores[self.task]) for row in self.rows)])
+
+
+def tables(board: Path) -> tuple[list[Table], list[str]]:
+    """All tables of a board, and why an entry is in none, one line each.
+
+    Raises:
+        TsbenchError: a verdict is damaged.
+    """
+    found: dict[str, list[tuple[Entry, str, tuple[str, ...]]]] = {}
+    left_out = []
+    for path in entries(board):
+        try:
+            entry = read_entry(path)
+        except TsbenchError as error:
+            left_out.append(str(error))
+            continue
+        verdict = recorded(board, path)
+        state = verdict.state if verdict and verdict.state else STATES[0]
+        reasons = verdict.reasons if verdict else ("no verdict is recorded",)
+        if state == RETRACTED:
+            left_out.append(f"{entry.name}: {'; '.join(reasons)}")
+            continue
+        found.setdefault(entry.manifest.task, []).append((entry, state, reasons))
+    return [_table(task, found.get(task, [])) for task in tasks.names()], left_out
+
+
+def _table(name: str, found: Sequence[tuple[Entry, str, tuple[str, ...]]]) -> Table:
+    task = tasks.make(name)
+    references = dict((stored(name) or {"rows": {}})["rows"])
+    best = float(references.pop("oracle", {"solved_reward": 0.0})["solved_reward"])
+    measure = next(iter(task.measure_notes.items()), ("", ""))
+    rewards = [
+        aggregate({name: {k.training.seed: k.training.claimed.solved_reward for k in entry.kept}})
+        for entry, _, _ in found
+    ]
+    top = max([best, *(reward.iqm for reward in rewards)], default=0.0)
+    rows = [
+        _row(entry, state, reasons, reward, top, measure[0])
+        for (entry, state, reasons), reward in zip(found, rewards, strict=True)
+    ]
+    rows.sort(key=lambda row: (-row.reward.iqm, row.name))
+    return Table(name, best, measure, tuple(rows), references)
+
+
+def _row(
+    entry: Entry,
+    state: str,
+    reasons: tuple[str, ...],
+    reward: Aggregate,
+    top: float,
+    measure: str,
+) -> Row:
+    scores = [kept.record.score for kept in entry.kept]
+    claims = [kept.training.claimed for kept in entry.kept]
+    known = [one for score in scores if (one := score.perturbed.measures.get(measure)) is not None]
+    names = ("normalized_reward", "success", "survival_100N", "recovery_100N")
+    figures: dict[str, float | None] = {
+        name: float(np.mean([getattr(claim, name) for claim in claims])) for name in names
+    }
+    figures["measure"] = float(np.mean(known)) if known else None
+    trainings = entry.manifest.trainings
+    costs = [(one.steps, one.physics_substeps, one.seconds) for one in trainings]
+    steps, substeps, seconds = np.mean(costs, axis=0).tolist()
+    surfaces = [np.mean(score.robustness.surface.survived, axis=-1) for score in scores]
+    return Row(
+        entry=entry,
+        state=state,
+        reasons=reasons,
+        reward=reward,
+        share=reward.iqm / top if top > 0.0 else 0.0,
+        figures=figures,
+        cost=(steps, substeps, seconds),
+        surface=np.mean(surfaces, axis=0),
+        forces=scores[0].robustness.surface.forces_N,
+    )
+
+
+def short(steps: float) -> str:
+    """A number of steps to three digits, with k for thousands and M for millions."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if steps >= size:
+            return f"{steps / size:.3g} {letter}"
+    return f"{steps:.0f}"
+
+
+def markdown(found: Sequence[Table], left_out: Sequence[str], before: str) -> str:
+    """The tables in Markdown, after the text `before`."""
+    lines = [before.rstrip()]
+    for table in found:
+        lines += ["", f"## {table.task}", ""]
+        head = ["entry", "solved_reward", "of the best known", "success", table.measure[0]]
+        head += ["survival_100N", "steps", "seconds", "state", "tuning trials", "seeds"]
+        lines += [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+        for row in table.rows:
+            figures, (steps, _, seconds) = row.figures, row.cost
+            trials = row.entry.manifest.described.tuning_trials
+            reward = number(row.reward.iqm)
+            if row.reward.interval:
+                low, high = row.reward.interval
+                reward += f" ({low:.3g} to {high:.3g})"
+            cells = [
+                row.name, reward, f"{row.share:.0%}", number(figures["success"]),
+                number(figures["measure"]), number(figures["survival_100N"]), short(steps),
+                duration(seconds), row.state, "not said" if trials is None else str(trials),
+                str(len(row.entry.kept)),
+            ]  # fmt: skip
+            lines.append(f"| {' | '.join(cells)} |")
+        for name, given in table.references.items():
+            cells = [
+                name, number(given["solved_reward"]), "", number(given["success"]), "",
+                number(given["survival_100N"]), "", "", "reference", "", "",
+            ]  # fmt: skip
+            lines.append(f"| {' | '.join(cells)} |")
+        lines += ["", f"The best plan earns {number(table.best)}."]
+    if left_out:
+        lines += ["", "Not shown:", "", *(f"- {as_markdown(line)}" for line in left_out)]
+    return "\n".join(lines) + "\n"
+
+
+def write_site(
+    board: Path, folder: Path, report: Report | None, tell: Callable[[str], None]
+) -> list[Path]:
+    """Writes the site: `index.html`, and for each entry a page, its manifest and its reports.
+
+    Files of an earlier site are replaced.
+
+    Args:
+        board: with the entries.
+        folder: of the site.
+        report: makes the page of a training, or None for a site without them.
+        tell: takes a line before each page that takes long.
+
+    Returns:
+        The files.
+
+    Raises:
+        TsbenchError: a file cannot be written, or a verdict is damaged.
+    """
+    found, left_out = tables(board)
+    templates = _templates()
+    written: dict[Path, bytes] = {}
+    index = templates.get_template("index.html")
+    page = index.render(tables=found, left_out=left_out, figures=FIGURES, protocol=V1.name)
+    written[folder / "index.html"] = page.encode()
+    one = templates.get_template("entry.html")
+    for table in found:
+        for row in table.rows:
+            home = folder / table.task / row.name
+            linked = report is not None
+            text = one.render(row=row, table=table, manifest=row.entry.manifest, reports=linked)
+            written[home / "index.html"] = text.encode()
+            written[home / MANIFEST] = (row.entry.path / MANIFEST).read_bytes()
+            for kept in row.entry.kept if report else ():
+                tell(f"{row.entry.name}, seed {kept.training.seed}: 3-D view and figures")
+                assert report is not None
+                written[home / f"{kept.training.folder}.html"] = report(kept.run).encode()
+    for path, content in written.items():
+        with os_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, content)
+    return list(written)
+
+
+def _templates() -> Environment:
+    templates = Environment(
+        loader=PackageLoader("tsbench.leaderboard", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.filters |= {"number": number, "short": short, "duration": duration}
+    style = importlib.resources.files("tsbench.leaderboard").joinpath("templates/style.css")
+    templates.globals["starts"] = V1.perturbed
+    templates.globals["style"] = style.read_text("utf-8")
+    return templates
