@@ -55,8 +55,8 @@ class HangError(Exception):
 
 
 def intact(folder: Path) -> Path:
-    """An entry made of the smallest kept run."""
-    runs = [path.parent for path in BOARD.glob("v1/*/*/*/score.json")]
+    """An entry made of the smallest kept run that has a plan."""
+    runs = [path.parent for path in BOARD.glob("v1/*/*/*/plan.npz")]
     run = min(runs, key=lambda run: sum(file.stat().st_size for file in run.iterdir()))
     described = submission.Described(
         "entry", ("A. Person",), "MIT", "https://example.org", "a PC", 0
