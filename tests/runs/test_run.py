@@ -29,6 +29,7 @@ from tsbench.core import words
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.core.policy import Policy
+from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.runs import config
 from tsbench.runs import directory as record
 from tsbench.runs import execute as run
@@ -265,6 +266,27 @@ def test_evaluate_replays_where_the_machine_differs(
     shown = capsys.readouterr().out
     assert "compared within 0.05 (extensions X86_V9 there, " in shown
     assert "physics replayed from the action log: equal" in shown
+
+
+def test_a_score_that_nothing_is_compared_with_is_not_confirmed(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    score = finished / "score.json"
+    content = json.loads(score.read_text())
+    content["score"]["origin"]["packages"]["mujoco"] = "3.16.0"
+    score.write_text(json.dumps(content))
+    assert cli.main(["evaluate", "one", "--json", "again.json"]) == 1
+    assert "one/score.json: not compared: made with another mujoco" in capsys.readouterr().out
+    assert json.loads(Path("again.json").read_text())["comparison"]["agrees"] is None
+
+
+@pytest.mark.usefixtures("finished")
+def test_another_protocol_asks_for_a_new_score(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(PROTOCOLS, "other", replace(PROTOCOLS["smoke"], name="other"))
+    assert cli.main(["evaluate", "one", "--protocol", "other"]) == 0
+    assert "not compared: made with another protocol (smoke, not other)" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("finished")
