@@ -26,7 +26,7 @@ from tsbench import tasks
 from tsbench.cli import launch
 from tsbench.cli import verbs as cli
 from tsbench.core import words
-from tsbench.core.errors import TsbenchError
+from tsbench.core.errors import PlanError, TsbenchError
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.core.policy import Policy
 from tsbench.evaluation.protocol import PROTOCOLS
@@ -450,9 +450,15 @@ def test_a_run_that_fails_later_keeps_what_it_has(
 
 def test_a_plan_that_fails_its_audit_ends_the_run(tmp_path: Path) -> None:
     """It is no fault that resuming could mend, so the message does not offer that."""
-    with pytest.raises(TsbenchError, match=r"fails its audit: .*; the plan is in .*mine") as caught:
+    with pytest.raises(PlanError, match=r"fails its audit: .*; the plan is in .*mine") as caught:
         execute(tmp_path / "mine", [*WORDS, "method.audit=stop"])
     assert "resume" not in str(caught.value)
+    with pytest.raises(PlanError, match=r"mine cannot go on: the plan fails its audit"):
+        run.resume(tmp_path / "mine")
+    with pytest.raises(
+        TsbenchError, match=r"mine holds a run whose plan has failed .* choose anoth"
+    ):
+        execute(tmp_path / "mine")
     assert (tmp_path / "mine" / "plan.npz").exists()
     assert not (tmp_path / "mine" / "policy.safetensors").exists()
 

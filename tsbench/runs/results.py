@@ -28,7 +28,6 @@ import numpy as np
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import write_whole
-from tsbench.core.task import plannable
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
 from tsbench.runs.config import RunConfig
@@ -64,7 +63,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Result:
-    """A finished training, or one that ended with a plan that fails its audit.
+    """A finished training, or one that ended with a plan that fails its audit or with none.
 
     Attributes:
         words: that `tsbench run` makes it with, without those that change no result.
@@ -218,15 +217,14 @@ def of_run(run: RunDirectory) -> Results | None:
     Raises:
         TsbenchError: a file is missing or damaged.
     """
-    failure = "" if run.finished else _failure(run)
-    if not (run.finished or failure):
+    if not (run.finished or run.failure):
         return None
-    result = _result(run, failure)
+    result = _result(run)
     curves = {result.words: read_curves(run.metrics_file)}
     return Results({result.words: result}, curves, {result.words: run})
 
 
-def _result(run: RunDirectory, failure: str) -> Result:
+def _result(run: RunDirectory) -> Result:
     config, record = run.config(), run.record() if run.finished else None
     task = run.task(config.task.name)
     with os_errors(run.config_file):
@@ -249,7 +247,7 @@ def _result(run: RunDirectory, failure: str) -> Result:
         settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16],
         stages=record.stages if record else _stages(run),
         score=record.score if record else None,
-        failure=failure,
+        failure=run.failure,
     )
 
 
@@ -259,22 +257,6 @@ def _stages(run: RunDirectory) -> tuple[Stage, ...]:
         (c.stage, int(c.steps[-1]), float(c.seconds[-1])) for c in read_curves(run.metrics_file)
     ]
     return tuple(Stage(name, steps, steps=steps, seconds=seconds) for name, steps, seconds in ends)
-
-
-def _failure(run: RunDirectory) -> str:
-    """Why an unfinished run can never be finished: its plan fails the audit that stops it."""
-    if not (run.plan_file.exists() and run.reference_file.exists()):
-        return ""
-    config = run.config()
-    budget = config.task.budgets[config.budget]
-    if (config.method.get("audit") or budget.audit) != "stop":
-        return ""
-    task = plannable(run.task(config.task.name))
-    plan, reference = run.plan(task), run.reference(task)
-    assert plan is not None
-    assert reference is not None
-    failures = task.audit(plan, reference).failures
-    return f"the plan fails its audit: {'; '.join(map(str, failures))}" if failures else ""
 
 
 def read_curves(metrics: Path) -> tuple[Curve, ...]:
