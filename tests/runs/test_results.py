@@ -143,3 +143,16 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
     (tmp_path / results.ROWS).write_text('{"task": 3}\n')
     with pytest.raises(TsbenchError, match=r"damaged results .*runs\.jsonl, line 1: task must be"):
         results.read([tmp_path])
+
+
+@pytest.mark.parametrize("name", [results.ROWS, results.CURVES])
+def test_only_regular_files_of_a_results_folder_are_read(
+    tmp_path: Path, invented_record: Callable[[str], Record], name: str
+) -> None:
+    run, out = begin(tmp_path / "run", ROCKET), tmp_path / "results"
+    finish(run, invented_record("rocket_navigation"))
+    results.collect(results.read([run.path]), out)
+    (out / name).rename(tmp_path / name)
+    (out / name).symlink_to(tmp_path / name)
+    with pytest.raises(TsbenchError, match=f"{name} is a link: only regular files are read"):
+        results.load(out)
