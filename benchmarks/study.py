@@ -7,7 +7,8 @@ them `trials=N` if their settings were tuned. What the results folder has is not
 others, finished runs are collected, and interrupted ones go on where they stopped, whatever
 stopped them. A run that was begun by another version of the code begins again. Each training has
 one thread and a low priority, and makes no pages. Ctrl-C, SIGTERM and `--hours` let each of them
-save its state first. A plan that fails its audit is a result: the run counts as zero.
+save its state first. A plan that fails, such as a roadmap without a way, is a result: the run
+counts as zero.
 """
 
 from __future__ import annotations

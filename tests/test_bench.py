@@ -70,6 +70,17 @@ def test_every_comparison(name: str) -> None:
         assert (shares[0] > 0.0) == stage.endswith("imitate")  # planning has no physics
 
 
+def test_only_other_packages_may_be_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "__path__", [*bench.__path__, str(tmp_path)])
+    (tmp_path / "lacking.py").write_text("import a_package_that_nobody_has\n")
+    assert bench.names.__wrapped__() == bench.names()
+    (tmp_path / "broken.py").write_text("import tsbench.core.a_module_that_has_moved\n")
+    with pytest.raises(ModuleNotFoundError, match="a_module_that_has_moved"):
+        bench.names.__wrapped__()
+
+
 def test_what_is_written_is_what_was_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

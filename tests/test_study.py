@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,18 +14,25 @@ from tsbench.core.files import write_json
 from tsbench.runs import results
 from tsbench.runs.directory import RunDirectory
 
-SPEC = spec_from_file_location("study", Path(__file__).parents[1] / "benchmarks" / "study.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-STUDY = module_from_spec(SPEC)
-sys.modules["study"] = STUDY  # where dataclasses look for the types of their fields
-SPEC.loader.exec_module(STUDY)
+
+def outside(name: str) -> Any:
+    """A program of benchmarks/ as a module."""
+    spec = spec_from_file_location(name, Path(__file__).parents[1] / "benchmarks" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[name] = module  # where dataclasses look for the types of their fields
+    spec.loader.exec_module(module)
+    return module
+
+
+STUDY, RELIABILITY = outside("study"), outside("reliability")
 SMALL = (
     "task=rocket_navigation method=twostage budget=smoke task.budgets.smoke.plan=1_024 "
     "task.budgets.smoke.act=1_024 task.training.plan.rollout=32 task.training.imitate.rollout=32"
 )
-
-
+# The obstacles stand between start and goal, and the roadmap has no other point.
+NO_WAY = "task=rocket_obstacles method=prm method.samples=0 budget=smoke"
 Study = Callable[..., tuple[int, str, str]]
 
 
@@ -64,6 +72,22 @@ def test_a_study_keeps_each_run_and_does_none_twice(study: Study) -> None:
     assert "begins again" in told
     assert run.versions() == versions
     assert len(results.load(Path("kept")).rows) == 2
+
+
+def test_a_roadmap_without_a_way_is_a_training_that_failed(study: Study) -> None:
+    for _ in range(2):  # it is not tried again
+        status, told, error = study(f"{NO_WAY} seed=0")
+        assert (status, error) == (0, "")
+    assert told == ""
+    (row,) = results.load(Path("kept")).rows.values()
+    assert row.failure.startswith("the roadmap of 0 samples has no way to the goal")
+    assert (row.solved_reward, row.normalized_reward, row.success) == (0.0, 0.0, 0.0)
+
+
+def test_the_table_of_reliability_counts_it_too(capsys: pytest.CaptureFixture[str]) -> None:
+    row = RELIABILITY.train(NO_WAY.split(), 0, 0.0)
+    assert (row["solved"], row["solved_reward"], row["normalized_reward"]) == (0.0, 0.0, 0.0)
+    assert "seed 0, rounding 0: the roadmap of 0 samples has no way" in capsys.readouterr().err
 
 
 def test_a_mistake_in_a_study_is_told_before_anything_runs(study: Study) -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.stats import qmc
 
 from tsbench import TsbenchError, tasks
+from tsbench.core.errors import PlanError
 from tsbench.core.motion import Roadmap
 from tsbench.core.roadmap import Lattice, Move, RoadmapSpace
 from tsbench.core.task import plannable, roadmap_space
@@ -138,7 +139,7 @@ def test_a_way_is_resampled_at_full_speed() -> None:
 
 
 def test_no_way_is_said_in_one_line() -> None:
-    with pytest.raises(TsbenchError, match=r"of 3 samples has no way .*more method\.samples"):
+    with pytest.raises(PlanError, match=r"of 3 samples has no way .*more method\.samples"):
         find_route(Plane(wall=True), 3, 2, 0)
 
 

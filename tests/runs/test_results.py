@@ -12,8 +12,6 @@ import pytest
 
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_json
-from tsbench.core.motion import Plan
-from tsbench.core.task import plannable
 from tsbench.runs import config, results
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.runs.execute import prepare
@@ -83,20 +81,13 @@ def test_a_finished_run_is_kept_with_its_words_distance_and_thin_curves(
     assert (curve.steps[0], curve.steps[-1], curve.returns[-1]) == (10, 10_000, 1)
 
 
-def test_a_plan_that_fails_its_audit_is_a_result_of_zero(
-    tmp_path: Path, naive_plan: Callable[[str], Plan]
-) -> None:
-    """The hand-made planner flies straight, too near to the obstacles."""
-    words = ["task=rocket_obstacles", "budget=smoke"]
-    for name, audit in (("stop", "stop"), ("warn", "warn")):
-        run = begin(tmp_path / name, [*words, f"method.audit={audit}"])
-        plan = naive_plan("rocket_obstacles")
-        plan.save(run.plan_file)
-        plannable(run.task("rocket_obstacles")).reference(plan).save(run.reference_file)
-    row = only(results.of_run(RunDirectory(tmp_path / "stop")))
-    assert "missing clearance from obstacle 1" in row.failure
+def test_a_plan_that_fails_is_a_result_of_zero(tmp_path: Path) -> None:
+    run = begin(tmp_path / "run", ROCKET)
+    assert results.of_run(run) is None  # it may still be finished
+    run.failure_file.write_text("the plan fails its audit\n")
+    row = only(results.of_run(run))
+    assert row.failure == "the plan fails its audit"
     assert (row.solved_reward, row.normalized_reward, row.success, row.steps) == (0, 0, 0, 50)
-    assert results.of_run(RunDirectory(tmp_path / "warn")) is None  # it may still be finished
 
 
 def test_results_are_read_as_they_were_kept_and_merged_by_their_words(
@@ -152,3 +143,16 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
     (tmp_path / results.ROWS).write_text('{"task": 3}\n')
     with pytest.raises(TsbenchError, match=r"damaged results .*runs\.jsonl, line 1: task must be"):
         results.read([tmp_path])
+
+
+@pytest.mark.parametrize("name", [results.ROWS, results.CURVES])
+def test_only_regular_files_of_a_results_folder_are_read(
+    tmp_path: Path, invented_record: Callable[[str], Record], name: str
+) -> None:
+    run, out = begin(tmp_path / "run", ROCKET), tmp_path / "results"
+    finish(run, invented_record("rocket_navigation"))
+    results.collect(results.read([run.path]), out)
+    (out / name).rename(tmp_path / name)
+    (out / name).symlink_to(tmp_path / name)
+    with pytest.raises(TsbenchError, match=f"{name} is a link: only regular files are read"):
+        results.load(out)

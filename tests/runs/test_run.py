@@ -26,9 +26,10 @@ from tsbench import tasks
 from tsbench.cli import launch
 from tsbench.cli import verbs as cli
 from tsbench.core import words
-from tsbench.core.errors import TsbenchError
+from tsbench.core.errors import PlanError, TsbenchError
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
 from tsbench.core.policy import Policy
+from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.runs import config
 from tsbench.runs import directory as record
 from tsbench.runs import execute as run
@@ -267,6 +268,27 @@ def test_evaluate_replays_where_the_machine_differs(
     assert "physics replayed from the action log: equal" in shown
 
 
+def test_a_score_that_nothing_is_compared_with_is_not_confirmed(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    score = finished / "score.json"
+    content = json.loads(score.read_text())
+    content["score"]["origin"]["packages"]["mujoco"] = "3.16.0"
+    score.write_text(json.dumps(content))
+    assert cli.main(["evaluate", "one", "--json", "again.json"]) == 1
+    assert "one/score.json: not compared: made with another mujoco" in capsys.readouterr().out
+    assert json.loads(Path("again.json").read_text())["comparison"]["agrees"] is None
+
+
+@pytest.mark.usefixtures("finished")
+def test_another_protocol_asks_for_a_new_score(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(PROTOCOLS, "other", replace(PROTOCOLS["smoke"], name="other"))
+    assert cli.main(["evaluate", "one", "--protocol", "other"]) == 0
+    assert "not compared: made with another protocol (smoke, not other)" in capsys.readouterr().out
+
+
 @pytest.mark.usefixtures("finished")
 def test_view_writes_a_page_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["view", "one", "--html", "page.html"]) == 0
@@ -428,9 +450,15 @@ def test_a_run_that_fails_later_keeps_what_it_has(
 
 def test_a_plan_that_fails_its_audit_ends_the_run(tmp_path: Path) -> None:
     """It is no fault that resuming could mend, so the message does not offer that."""
-    with pytest.raises(TsbenchError, match=r"fails its audit: .*; the plan is in .*mine") as caught:
+    with pytest.raises(PlanError, match=r"fails its audit: .*; the plan is in .*mine") as caught:
         execute(tmp_path / "mine", [*WORDS, "method.audit=stop"])
     assert "resume" not in str(caught.value)
+    with pytest.raises(PlanError, match=r"mine cannot go on: the plan fails its audit"):
+        run.resume(tmp_path / "mine")
+    with pytest.raises(
+        TsbenchError, match=r"mine holds a run whose plan has failed .* choose anoth"
+    ):
+        execute(tmp_path / "mine")
     assert (tmp_path / "mine" / "plan.npz").exists()
     assert not (tmp_path / "mine" / "policy.safetensors").exists()
 

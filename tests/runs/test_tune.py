@@ -16,16 +16,19 @@ from typing import Any
 
 import pytest
 
-from tsbench import TsbenchError
+from tsbench import TsbenchError, methods
 from tsbench.cli import verbs
-from tsbench.core.errors import NotFiniteError
-from tsbench.runs import config, tune
+from tsbench.core import plugins
+from tsbench.core.errors import NotFiniteError, PlanError
+from tsbench.runs import config, execute, tune
 from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.tune import Dimension, Study
 
 KEY = "task.training.task.entropy"
 WORDS = ("task=rocket_navigation", "method=monolithic", "budget=smoke")
+# A plug-in's method may have no search space; it is then refused (below).
+OWN = [n for n in methods.names() if methods.stages(n) and methods.provider(n) == plugins.own()]
 Made = Callable[[RunConfig, Sequence[str]], None]
 
 
@@ -123,6 +126,30 @@ def test_settings_that_diverge_are_a_trial_spent(tmp_path: Path, scored: Any) ->
 
     tune.tune(given, 2, run=run)
     assert [trial.state.name for trial in trials(given)] == ["FAIL", "COMPLETE"]
+
+
+def test_a_plan_that_fails_is_worth_nothing(tmp_path: Path, scored: Any) -> None:
+    """Its trial is complete: the settings are as good as their other seeds make them."""
+    given = study(tmp_path)
+
+    def run(made: RunConfig, words: Sequence[str]) -> None:
+        if made.seed == tune.FIRST_SEED + 1:
+            raise PlanError("the plan fails its audit")
+        scored(lambda entropy: 0.6)(made, words)
+
+    tune.tune(given, 1, run=run)
+    (trial,) = trials(given)
+    assert trial.state.name == "COMPLETE"
+    assert trial.value == pytest.approx(2.0 / 3.0 * (0.6 + 0.5e-3))
+
+
+def test_a_roadmap_without_a_way_is_worth_nothing(tmp_path: Path) -> None:
+    """Real runs: the obstacles stand between start and goal, and there is no other point."""
+    words = ("task=rocket_obstacles", "method=prm", "method.samples=0", "budget=smoke")
+    given = Study(words, {"method.neighbours": Dimension(1, 2)}, tmp_path / "study")
+    tune.tune(given, 1)
+    (trial,) = trials(given)
+    assert (trial.state.name, trial.value) == ("COMPLETE", 0.0)
 
 
 def test_another_failure_is_resumed(tmp_path: Path, scored: Any) -> None:
@@ -239,7 +266,7 @@ def test_wrong_ranges(values: dict[str, Any], line: str) -> None:
         Dimension(**values)
 
 
-@pytest.mark.parametrize("method", ["twostage", "monolithic"])
+@pytest.mark.parametrize("method", OWN)
 def test_every_range_is_a_word_of_run(method: str) -> None:
     """Both ends of every range and all choices make a configuration."""
     space = tune.search_space(method)
@@ -247,7 +274,10 @@ def test_every_range_is_a_word_of_run(method: str) -> None:
     assert prepared.space == space
     for key, dimension in space.items():
         for value in dimension.choices or (dimension.low, dimension.high):
-            prepared.run(0, {key: value}, 0)
+            execute.prepare(prepared.run(0, {key: value}, 0))
+    for end in ("low", "high"):  # all at once: no trial may choose what the method refuses
+        ends = {key: getattr(one, end) for key, one in space.items() if not one.choices}
+        execute.prepare(prepared.run(0, ends, 0))
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError
@@ -77,6 +78,13 @@ def test_a_method_has_one_colour_and_its_variants_paler_ones(make: Callable[...,
     colours = [group.colour for group in groups]
     assert colours[:3] == [COLOURS[OURS], COLOURS[OURS], COLOURS[PRM]]
     assert len(set(colours)) == 5
+
+
+def test_any_method_has_its_own_name_and_colour(make: Callable[..., Result]) -> None:
+    rows = [make(f"other{i}", 0, 0.1) for i in range(20)]
+    groups = grouped(of([*rows, *(make(name, 0, 0.1) for name in COLOURS)]).groups())
+    assert [group.label for group in groups] == [*COLOURS, *sorted(row.method for row in rows)]
+    assert len({to_hex(group.colour) for group in groups}) == len(groups)
 
 
 def test_an_order_holds_by_its_interval_and_not_by_its_mean(make: Callable[..., Result]) -> None:

@@ -13,7 +13,6 @@ import os
 import pkgutil
 import platform
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -131,10 +130,14 @@ def comparison(
 
 @cache
 def names() -> tuple[str, ...]:
-    """The names of all comparisons, sorted."""
+    """The names of all comparisons whose files' packages are installed, sorted."""
     for module in pkgutil.iter_modules(__path__):
-        with suppress(ModuleNotFoundError):  # of what a machine without a network was not given
+        try:
             importlib.import_module(f"{__name__}.{module.name}")
+        except ModuleNotFoundError as error:
+            # A machine without a network may lack other packages, but no module of this one.
+            if (error.name or "").partition(".")[0] == __name__.partition(".")[0]:
+                raise
     return tuple(sorted(_comparisons))
 
 

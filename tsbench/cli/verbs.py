@@ -101,8 +101,9 @@ class Verb:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns its exit status.
 
-    The status is 0 for success, 1 for a score that differs from the recorded one or a closed
-    output, 2 for a user's mistake, 130 for Ctrl-C and 143 for SIGTERM.
+    The status is 0 for success, 1 for a score that differs from the recorded one or cannot be
+    compared with it, and for a closed output, 2 for a user's mistake, 130 for Ctrl-C and 143 for
+    SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -354,10 +355,11 @@ def _evaluate(words: Sequence[str]) -> int:
     console.print(tables.score_table(f"{task.name}: {options.policy}", score, task))
     tables.show_rank(console, standard, score)
     shown: dict[str, Any] = {**score.as_dict(), "standard": standard}
-    agrees = None
+    confirmed = True
     if kept is not None:
         comparison = compare(kept.score, score, task, log)
-        agrees = comparison.agrees
+        # Who names another protocol asks for a new score, and not whether the kept one is right.
+        confirmed = bool(comparison.agrees) or protocol.name != kept.score.protocol
         made = replace(kept, score=score, standard=standard)
         shown = directory.shown(made) | {"comparison": vars(comparison)}
         line = f" {run.score_file}: {comparison.words}"
@@ -382,7 +384,7 @@ def _evaluate(words: Sequence[str]) -> int:
         )
         shown |= {"physics": {"score": other.as_dict(), "flips": [vars(one) for one in flipped]}}
     write_json(options.json, shown)
-    return int(agrees is False)
+    return int(not confirmed)
 
 
 def _engine(physics: str | None) -> Any:

@@ -48,8 +48,8 @@ class TsbenchError(Exception):
 
 
 class PlanError(TsbenchError):
-    """A plan fails its audit, so nothing is to be learned from it. To resume the run would give the
-    same plan again."""
+    """A plan fails its audit, or there is none, so nothing is to be learned from it. To resume the
+    run would give the same plan again: the training has failed, and counts as zero."""
 
 
 class NotFiniteError(TsbenchError):

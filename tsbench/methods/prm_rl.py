@@ -179,9 +179,8 @@ def drivable_route(
     such edges that were found.
 
     Raises:
-        TsbenchError: the roadmap has no way to the goal.
-        PlanError: the way has edges that cannot be driven or were not tried, and that stops the
-            run.
+        PlanError: the roadmap has no way to the goal; or the way has edges that cannot be driven
+            or were not tried, and that stops the run.
     """
     graph = connected(space, sampled(space, chosen.samples, problem.seed), chosen.neighbours)
     short = space.steps(*graph.points[graph.edges.T]) <= chosen.reach

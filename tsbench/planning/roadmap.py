@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
-from tsbench.core.errors import TsbenchError
+from tsbench.core.errors import PlanError
 from tsbench.core.motion import Plan, Roadmap
 from tsbench.core.roadmap import Lattice, RoadmapSpace
 
@@ -108,7 +108,7 @@ def find_route(
         shortcut: whether the way is straightened.
 
     Raises:
-        TsbenchError: the roadmap has no way from start to goal.
+        PlanError: the roadmap has no way from start to goal.
     """
     graph = connected(space, sampled(space, samples, seed), neighbours)
     way = graph.quickest(0, 1)
@@ -127,8 +127,8 @@ def sampled(space: RoadmapSpace[Any], samples: int, seed: int) -> np.ndarray:
     return np.concatenate([[space.start, space.goal], points[space.free(points, points)]])
 
 
-def no_way(samples: int) -> TsbenchError:
-    return TsbenchError(
+def no_way(samples: int) -> PlanError:
+    return PlanError(
         f"the roadmap of {samples} samples has no way to the goal: "
         "more method.samples or method.neighbours are needed"
     )

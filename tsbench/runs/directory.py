@@ -31,6 +31,7 @@ MAX_CONFIG = 16 * 2**10
 MAX_VERSIONS = 64 * 2**10
 MAX_SCORE = 512 * 2**10
 MAX_METRICS = 32 * 2**20
+MAX_FAILURE = 16 * 2**10
 
 # File names that `workspace` uses. `RunDirectory` has the paths of all files.
 METRICS = "metrics.jsonl"
@@ -131,6 +132,7 @@ class RunDirectory:
     events_file = _File(EVENTS)
     checkpoints = _File(CHECKPOINTS)
     dump_file = _File("not-finite.npz")
+    failure_file = _File("failure.txt")  # the line that a failed plan has ended the run with
     plan_file = _File("plan.npz")
     reference_file = _File("reference.npz")
     roadmap_file = _File("roadmap.npz")
@@ -157,6 +159,13 @@ class RunDirectory:
     def finished(self) -> bool:
         """Whether a run in this directory has been trained and scored."""
         return _there(self.score_file)
+
+    @property
+    def failure(self) -> str:
+        """Why the run can never be finished: its plan has failed. "" if it has not failed."""
+        if self.finished or not _there(self.failure_file):
+            return ""
+        return read_file(self.failure_file, MAX_FAILURE, "failure").decode(errors="replace").strip()
 
     def config(self) -> RunConfig:
         """The configuration of the run."""

@@ -97,7 +97,7 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
             line = f"{' '.join(['tsbench run', *words])} -> {run.path}"
             return _work(config, problem, run, line, console or Console())
         except (TsbenchError, OSError) as error:
-            if not run.trained and not isinstance(error, NotFiniteError):
+            if not run.trained and not isinstance(error, (NotFiniteError, PlanError)):
                 _leave_as_found(run.path, found)
             raise
 
@@ -123,6 +123,7 @@ def resume(directory: Path, console: Console | None = None) -> Score:
     Raises:
         TsbenchError: the run does not exist, is finished or is running, or was begun with another
             configuration or other versions. Beyond that, as `execute`.
+        PlanError: the run has ended with a plan that fails, as it would again.
         Stopped: Ctrl-C or SIGTERM stopped the run.
     """
     run = RunDirectory(directory)
@@ -133,6 +134,8 @@ def resume(directory: Path, console: Console | None = None) -> Score:
     with _locked(directory):
         if run.finished:
             raise TsbenchError(f"{directory} holds a finished run: there is nothing to resume")
+        if run.failure:
+            raise PlanError(f"{directory} cannot go on: {run.failure}")
         config = replace(run.config(), directory=str(directory))
         problem = prepare(config)
         check_provenance(run, config, problem)
@@ -227,9 +230,12 @@ def _explained(run: RunDirectory) -> Iterator[None]:
         with os_errors(run.path):
             yield
     except NotFiniteError as error:
-        raise TsbenchError(f"{error}{_dumped(run.dump_file, error)}") from error
+        raise NotFiniteError(f"{error}{_dumped(run.dump_file, error)}", error.arrays) from error
     except PlanError as error:
-        raise TsbenchError(f"{error}; the plan is in {run.path}") from error
+        with os_errors(run.failure_file):
+            write_whole(run.failure_file, f"{error}\n".encode())
+        place = f"; the plan is in {run.path}" if run.plan_file.exists() else ""
+        raise PlanError(f"{error}{place}") from error
     except TsbenchError as error:
         raise TsbenchError(f"{error}{_way_on(run)}") from error
     except Stopped as stopped:
@@ -295,6 +301,8 @@ def _create(run: RunDirectory) -> None:
     elsewhere = "choose another directory=PATH"
     if run.finished:
         raise taken(run.path, "a finished run", elsewhere)
+    if run.failure:
+        raise taken(run.path, "a run whose plan has failed", elsewhere)
     if run.config_file.exists():
         way_out = f"go on with resume={run.path}, or {elsewhere}"
         raise taken(run.path, "an unfinished run", way_out)

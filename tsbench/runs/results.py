@@ -27,20 +27,22 @@ import numpy as np
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
-from tsbench.core.files import write_whole
-from tsbench.core.task import plannable
+from tsbench.core.files import parse_json, read_file, write_whole
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
 from tsbench.runs.config import RunConfig
-from tsbench.runs.directory import RunDirectory, Stage
+from tsbench.runs.directory import MAX_SCORE, RunDirectory, Stage, read_metrics
 
 ROWS = "runs.jsonl"
 CURVES = "curves.npz"
 POLICIES = "policies"
 POINTS = 200  # of a learning curve, for each stage
 MEASURE = "normalized_return"  # of `metrics.jsonl`
-COMMAND = "# tsbench run "  # begins a run's configuration file
+COMMAND = "tsbench run "  # begins a run's command
 CONSTANTS = "task.constants."
+# Limits of the files, in bytes. The curves of a stage are 2.4 KB.
+MAX_ROWS = 2_000 * MAX_SCORE
+MAX_CURVES = 2**28
 ELSEWHERE = ("directory", "threads", "checkpoint")  # words that change no result
 
 
@@ -64,7 +66,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Result:
-    """A finished training, or one that ended with a plan that fails its audit.
+    """A finished training, or one that ended with a plan that fails its audit or with none.
 
     Attributes:
         words: that `tsbench run` makes it with, without those that change no result.
@@ -218,19 +220,16 @@ def of_run(run: RunDirectory) -> Results | None:
     Raises:
         TsbenchError: a file is missing or damaged.
     """
-    failure = "" if run.finished else _failure(run)
-    if not (run.finished or failure):
+    if not (run.finished or run.failure):
         return None
-    result = _result(run, failure)
+    result = _result(run)
     curves = {result.words: read_curves(run.metrics_file)}
     return Results({result.words: result}, curves, {result.words: run})
 
 
-def _result(run: RunDirectory, failure: str) -> Result:
+def _result(run: RunDirectory) -> Result:
     config, record = run.config(), run.record() if run.finished else None
     task = run.task(config.task.name)
-    with os_errors(run.config_file):
-        first = run.config_file.read_text(encoding="utf-8").partition("\n")[0]
     settings = {
         "budget": asdict(config.task.budgets[config.budget]),
         "training": config.task.training,
@@ -238,7 +237,7 @@ def _result(run: RunDirectory, failure: str) -> Result:
         "method": config.method,
     }
     return Result(
-        words=words_of(config, first.removeprefix(COMMAND).split()),
+        words=words_of(config, run.command.removeprefix(COMMAND).split()),
         task=task.name,
         method=config.method["name"],
         seed=config.seed,
@@ -249,7 +248,7 @@ def _result(run: RunDirectory, failure: str) -> Result:
         settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16],
         stages=record.stages if record else _stages(run),
         score=record.score if record else None,
-        failure=failure,
+        failure=run.failure,
     )
 
 
@@ -261,22 +260,6 @@ def _stages(run: RunDirectory) -> tuple[Stage, ...]:
     return tuple(Stage(name, steps, steps=steps, seconds=seconds) for name, steps, seconds in ends)
 
 
-def _failure(run: RunDirectory) -> str:
-    """Why an unfinished run can never be finished: its plan fails the audit that stops it."""
-    if not (run.plan_file.exists() and run.reference_file.exists()):
-        return ""
-    config = run.config()
-    budget = config.task.budgets[config.budget]
-    if (config.method.get("audit") or budget.audit) != "stop":
-        return ""
-    task = plannable(run.task(config.task.name))
-    plan, reference = run.plan(task), run.reference(task)
-    assert plan is not None
-    assert reference is not None
-    failures = task.audit(plan, reference).failures
-    return f"the plan fails its audit: {'; '.join(map(str, failures))}" if failures else ""
-
-
 def read_curves(metrics: Path) -> tuple[Curve, ...]:
     """The learning curves of a run's `metrics.jsonl`, thinned to `POINTS`; none without the file.
 
@@ -286,15 +269,12 @@ def read_curves(metrics: Path) -> tuple[Curve, ...]:
     if not metrics.exists():
         return ()
     found: dict[str, list[tuple[float, float, float]]] = {}
-    with os_errors(metrics):
-        lines = metrics.read_text(encoding="utf-8").splitlines()
-    for line in lines:
+    for row in read_metrics(metrics):
         try:
-            row = json.loads(line)
             if MEASURE in row:
                 point = (row["steps"], row["seconds"], row[MEASURE])
                 found.setdefault(row["stage"], []).append(point)
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (KeyError, TypeError) as error:
             raise TsbenchError(f"damaged metrics {metrics}: {error}") from None
     return tuple(Curve(stage, *_thinned(points)) for stage, points in found.items())
 
@@ -313,12 +293,10 @@ def load(place: Path) -> Results:
         TsbenchError: a file is missing or damaged.
     """
     rows, found = place / ROWS, Results()
-    with os_errors(rows):
-        lines = rows.read_text(encoding="utf-8").splitlines()
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_file(rows, MAX_ROWS, "results").splitlines(), 1):
         try:
-            result: Result = typed(Result, json.loads(line), "")
-        except (ValueError, RecursionError, TsbenchError) as error:
+            result: Result = typed(Result, parse_json(line), "")
+        except (ValueError, OverflowError, TsbenchError) as error:
             raise TsbenchError(f"damaged results {rows}, line {number}: {error}") from None
         found.rows[result.words] = result
     for words, curves in _load_curves(place / CURVES).items():
@@ -335,8 +313,9 @@ def _load_curves(path: Path) -> dict[tuple[str, ...], tuple[Curve, ...]]:
     if not path.exists():
         return {}
     found: dict[tuple[str, ...], tuple[Curve, ...]] = {}
+    content = io.BytesIO(read_file(path, MAX_CURVES, "curves"))
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(content, allow_pickle=False) as file:
             for name in file.files:
                 *words, stage = name.split(" ")
                 curve = Curve(stage, *file[name])

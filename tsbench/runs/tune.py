@@ -27,7 +27,7 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from tsbench.core import plugins
-from tsbench.core.errors import NotFiniteError, TsbenchError, os_errors
+from tsbench.core.errors import NotFiniteError, PlanError, TsbenchError, os_errors
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
 from tsbench.runs import config, execute
@@ -230,7 +230,10 @@ def _work(study: Study, shared: optuna.Study, trial: Trial, run: Execute) -> str
         except NotFiniteError as error:  # these settings diverge
             shared.tell(trial, state=TrialState.FAIL)
             return f"{about} failed: {error}"
-        values.append(value(RunDirectory(Path(made.directory or "")).record().score))
+        except PlanError:  # a training that fails is worth nothing
+            values.append(0.0)
+        else:
+            values.append(value(RunDirectory(Path(made.directory or "")).record().score))
         if len(values) == 1:
             if not shared.trials[trial.number].intermediate_values:  # else it is resumed
                 trial.report(values[0], step=0)

@@ -19,13 +19,15 @@ from tsbench.core.words import several
 from tsbench.evaluation.statistics import Difference, paired_difference
 from tsbench.runs.results import Result
 
-# The paper's methods, by the names that they have here.
+# The paper's methods, by the names that they have here. They stand here and not beside each method,
+# because the figures tell what the paper claims of these four, most often of two of them together.
+# Any other method needs no line: it has its own name and a spare colour.
 OURS, MONOLITHIC, PRM, PRM_RL = "twostage", "monolithic", "prm", "prm_rl"
 
 # Colours of Okabe and Ito's palette, which colour-blind readers can tell apart. A method has the
 # same one in every figure; one that is not of the paper has a spare one.
 COLOURS = {OURS: "#d55e00", PRM: "#009e73", PRM_RL: "#cc79a7", MONOLITHIC: "#0072b2"}
-SPARE = ("#e69f00", "#56b4e9", "#000000")
+SPARE = ("#e69f00", "#56b4e9", "#000000", "#f0e442", *matplotlib.color_sequences["tab20b"])
 
 WIDTH = 6.4  # inches; a picture as wide as a phone still shows its text
 DPI = 150
