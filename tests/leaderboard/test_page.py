@@ -66,7 +66,8 @@ def test_rows_are_sorted_and_say_how_sure_they_are(board: Path) -> None:
     low, high = rows["ten"].reward.interval or (0.0, 0.0)
     assert low == pytest.approx(high)  # ten equal trainings
     assert low == pytest.approx(claimed.solved_reward)
-    assert rows["one"].share == claimed.solved_reward / max(table.best, claimed.solved_reward)
+    best = max(table.best, claimed.solved_reward)
+    assert rows["one"].share == pytest.approx(claimed.solved_reward / best)
     assert rows["one"].state == "re-scored"
     assert rows["ten"].state == "submitted"
     assert left_out == [f"v1/{TASK}/gone: retracted: a bug"]
