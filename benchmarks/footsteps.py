@@ -11,7 +11,7 @@ in stance; whether the plan passes its audit.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 from typing import Any
 
@@ -54,6 +54,13 @@ def figures(task: Plannable[Any], plan: Plan) -> list[float]:
     return [steps, earned, *stride, 1e3 * slip, audit.passed]
 
 
+def layered() -> list[str]:
+    """The tasks whose roadmap can be layered by a gait."""
+    made = {name: tasks.make(name) for name in tasks.names()}
+    planned = {name: task for name, task in made.items() if isinstance(task, Plannable)}
+    return [name for name, task in planned.items() if task.abstraction().lattice() is not None]
+
+
 def main(names: list[str]) -> None:
     for name in names:
         task = plannable(tasks.make(name))
@@ -83,4 +90,6 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or ["laikago_trot", "laikago_walk"])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("tasks", nargs="*", metavar="TASK", choices=layered(), default=layered())
+    main(parser.parse_args().tasks)
