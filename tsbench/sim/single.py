@@ -119,6 +119,7 @@ class PhysicsAdapter(Adapter):
 
     def begin(self, physics: dm_mujoco.Physics) -> None:
         start = self.task.start(self.rng, 1, perturbed=self.perturbed)
+        self._sensors = sensor_slices(physics.model.ptr)
         physics.data.qpos[:] = start.qpos[0]
         physics.data.qvel[:] = start.qvel[0]
         physics.forward()
@@ -151,14 +152,13 @@ class PhysicsAdapter(Adapter):
 
     def _read(self, physics: dm_mujoco.Physics, time: np.ndarray, memory: np.ndarray) -> None:
         data = physics.data
-        sensors = sensor_slices(physics.model.ptr)
         self.state = self.plant.read(
             Readings(
                 time=time,
                 qpos=data.qpos[None].copy(),
                 qvel=data.qvel[None].copy(),
                 sensors={
-                    name: data.sensordata[part][None].copy() for name, part in sensors.items()
+                    name: data.sensordata[part][None].copy() for name, part in self._sensors.items()
                 },
                 memory=memory,
             )

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from tsbench.core.arrays import Array, array_namespace, filled, like
+from tsbench.core.arrays import Array, array_namespace, filled, like, norm
 from tsbench.core.constants import constant
 from tsbench.core.drawing import Drawing
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
@@ -214,8 +214,7 @@ class Laikago(Plannable[LaikagoState]):
 
     def goal_distance(self, state: LaikagoState) -> Array:
         """Of the base, on the ground plane, in metres, shape (...,)."""
-        xp = array_namespace(state.base_position)
-        return xp.linalg.vector_norm(self.goal_offset(state), axis=-1)
+        return norm(self.goal_offset(state))
 
     def reward_terms(
         self, previous: LaikagoState, action: Array | None, state: LaikagoState
@@ -231,7 +230,7 @@ class Laikago(Plannable[LaikagoState]):
         contacts = self.gait.contacts(state.time)
         stance = contacts & self.gait.contacts(previous.time)
         moved = state.feet - previous.feet
-        slip = xp.where(stance, xp.linalg.vector_norm(moved[..., :2], axis=-1), 0.0)
+        slip = xp.where(stance, norm(moved[..., :2]), 0.0)
         height_error = state.feet[..., 2] - C.foot_radius - xp.where(contacts, 0.0, C.swing_height)
         return {
             "near the goal": xp.exp(C.distance_decay * self.goal_distance(state)),
@@ -275,16 +274,16 @@ class Laikago(Plannable[LaikagoState]):
     ) -> LaikagoCourse:
         assert isinstance(course, LaikagoCourse)
         xp = array_namespace(state.feet)
-        distance = self.goal_distance(state)
-        gained = xp.clip(course.nearest - distance, 0.0, None)
+        nearest = xp.minimum(course.nearest, self.goal_distance(state))
+        gained = course.nearest - nearest
         scheduled = self.gait.contacts(state.time)
         down = state.feet[..., 2] - C.foot_radius < C.sole_height
         # Shares of all feet: multiples of a quarter, so that sums and differences are exact.
         marks = xp.stack([scheduled, down, scheduled & down])
-        stand, touch, both = xp.mean(xp.astype(marks, gained.dtype), axis=-1)
+        stand, touch, both = xp.sum(xp.astype(marks, gained.dtype), axis=-1) / len(FEET)
         return LaikagoCourse(
             violated=course.violated | self.violated(state),
-            nearest=xp.minimum(course.nearest, distance),
+            nearest=nearest,
             stance=course.stance + gained * stand,
             stance_kept=course.stance_kept + gained * both,
             swing=course.swing + gained * (1.0 - stand),
@@ -365,7 +364,7 @@ class Laikago(Plannable[LaikagoState]):
         """
         xp = array_namespace(last.base_position)
         seconds = steps * self.timestep
-        gone = xp.linalg.vector_norm((last.base_position - first.base_position)[..., :2], axis=-1)
+        gone = norm((last.base_position - first.base_position)[..., :2])
         arrived = self.reached(last) & ~course.violated
         found = {
             "footfall agreement": self.footfall(course),
@@ -667,7 +666,7 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         xp = array_namespace(action)
         action = xp.clip(action, -1.0, 1.0)
         push, step = action[..., :3], action[..., 3:]
-        push = push / xp.clip(xp.linalg.vector_norm(push, axis=-1)[..., None], 1.0, None)
+        push = push / xp.clip(norm(push)[..., None], 1.0, None)
         move, swing = self.base_step * push, self.swing_step
         ahead = self._ahead(state)
         # The action gives a foot's displacement in the world frame: zero leaves the foot in place.
@@ -741,7 +740,7 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         weight = xp.astype(self.gait.contacts(state.time), state.feet.dtype)[..., None]
         support = xp.sum(weight * state.feet[..., :2], axis=-2) / xp.sum(weight, axis=-2)
         offset = state.base_position[..., :2] - support
-        return xp.exp(COM_DECAY * xp.linalg.vector_norm(offset, axis=-1))
+        return xp.exp(COM_DECAY * norm(offset))
 
     def flatten(self, state: LaikagoState) -> Array:
         xp = array_namespace(state.feet)

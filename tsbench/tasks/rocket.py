@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from tsbench.core.arrays import Array, array_namespace, like
+from tsbench.core.arrays import Array, array_namespace, like, norm
 from tsbench.core.constants import constant
 from tsbench.core.drawing import Drawing, Flame
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
@@ -172,14 +172,13 @@ class Rocket(Plannable[RocketState]):
         """Goal relative to the rocket (2), distance, heading error; shape (..., 4)."""
         xp = array_namespace(state.position)
         offset = like(state.position, self.goal) - state.position
-        distance = xp.linalg.vector_norm(offset, axis=-1)
+        distance = norm(offset)
         bearing = xp.atan2(offset[..., 1], offset[..., 0])
         heading_error = wrap(bearing - (state.angle + math.pi / 2))
         return xp.concat([offset, distance[..., None], heading_error[..., None]], axis=-1)
 
     def goal_distance(self, state: RocketState) -> Array:
-        xp = array_namespace(state.position)
-        return xp.linalg.vector_norm(state.position - like(state.position, self.goal), axis=-1)
+        return norm(state.position - like(state.position, self.goal))
 
     def reward_terms(
         self, previous: RocketState, action: Array, state: RocketState
@@ -189,7 +188,7 @@ class Rocket(Plannable[RocketState]):
         terms = {"near the goal": C.goal_weight * xp.exp(C.goal_decay * self.goal_distance(state))}
         for number, obstacle in enumerate(self.obstacles, 1):
             offset = state.position - like(state.position, obstacle)
-            distance = xp.linalg.vector_norm(offset, axis=-1)
+            distance = norm(offset)
             terms[f"near obstacle {number}"] = -C.obstacle_weight * xp.exp(
                 C.obstacle_decay * distance
             )
@@ -221,8 +220,7 @@ class Rocket(Plannable[RocketState]):
     def success(self, state: RocketState, course: Course) -> Array:
         """At the end of the episode within 1 m of the goal and slower than 1 m/s; no collision and
         never out of bounds on the way."""
-        xp = array_namespace(state.position)
-        speed = xp.linalg.vector_norm(state.velocity, axis=-1)
+        speed = norm(state.velocity)
         there = (self.goal_distance(state) < C.success_distance) & (speed < C.success_speed)
         return there & ~course.violated
 
@@ -358,7 +356,7 @@ class Rocket(Plannable[RocketState]):
         """A state at rest at positions (..., 2), its clearance that of a disc around the hull."""
         xp = array_namespace(position)
         clearance = [
-            xp.linalg.vector_norm(position - like(position, obstacle), axis=-1)[..., None]
+            norm(position - like(position, obstacle))[..., None]
             - (C.obstacle_radius + C.hull_radius)
             for obstacle in self.obstacles
         ]
