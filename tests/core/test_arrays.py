@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,7 @@ from tsbench.planning.gait import Gait
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_norm_has_the_bits_of_numpys(components: int, dtype: type) -> None:
     rng = np.random.default_rng(components)
-    vectors = rng.standard_normal((33, 4, components)).astype(dtype)
+    vectors: Any = rng.standard_normal((33, 4, components)).astype(dtype)
     for view in (vectors, vectors[::2], vectors[..., ::-1]):
         assert np.array_equal(norm(view), np.linalg.vector_norm(view, axis=-1))
 
