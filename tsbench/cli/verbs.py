@@ -33,6 +33,7 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
+  loggers=[...]    what shows the training: tensorboard, wandb, mlflow ([tensorboard])
   device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
   deterministic=true
                    the same bits each time on a GPU, for more time
