@@ -151,9 +151,9 @@ def evaluate(
 
     Args:
         policy: a `tsbench.core.policy.Policy`, the directory of one, an ONNX file, "zero" or
-            "random", a stable-baselines3 model, or any function of one observation (o,) that
-            returns one action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
-            `tsbench.evaluation.foreign.from_sb3`.
+            "random", a model of stable-baselines3 or rsl-rl, a torch module, or any function of one
+            observation (o,) that returns one action (a,) in [-1, 1]. For a file that
+            stable-baselines3 saved there is `tsbench.evaluation.foreign.from_sb3`.
         task: its name.
         protocol: "v1", or "smoke" for a first look that cannot be ranked.
         threads: CPU threads of the physics; None takes all cores. The score does not depend on it.
@@ -175,13 +175,7 @@ def evaluate(
     if isinstance(policy, (str, Path)):
         policy = references.named(Path(policy), made) or foreign.load(Path(policy), made)
     if not isinstance(policy, (Policy, foreign.ForeignPolicy)):
-        if callable(policy):
-            policy = foreign.from_function(policy, made)
-        elif hasattr(policy, "predict"):
-            policy = foreign.from_sb3_model(policy, made)
-        else:
-            kind = type(policy).__name__
-            raise TsbenchError(f"a policy must be a model, a file or a function, not {kind}")
+        policy = foreign.made(policy, made)
     return score(policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads)
 
 
