@@ -202,7 +202,7 @@ def _shares(
     rows = zip(forces, share.mean(axis=1), strict=True)
     words = "; ".join(f"{mean:.0%} at {force:.3g} N" for force, mean in rows)
     title = f"Share of pushes {what}, by force and {label.split(',')[0]}"
-    return svg(figure, Chart(f"{what}-{label.split()[0]}", title, words))
+    return svg(figure, Chart(f"{what}-{label[:4]}", title, words))
 
 
 def learning(metrics: Path) -> str | None:

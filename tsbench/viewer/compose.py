@@ -43,7 +43,7 @@ ROADMAP_NOTE = f"straight ways that are free, the shortest {MOST_EDGES:,} at mos
 
 EXECUTED_NOTE = "the policy's motion in full physics; its path is orange"
 PLAN_NOTE = "the planned motion, without physics; translucent"
-PAIR_NOTE = "this policy's motion in full physics; its path has this colour"
+PAIR_NOTE = "its motion in full physics; the path in this colour"
 
 STAND_PLANNED = Entry("planned contact", PLAN_COLOUR, "where a foot should stand now")
 STAND = Entry("contact", EXECUTED_COLOUR, "where a foot presses on the ground now")

@@ -176,9 +176,10 @@ def pair(runs: Sequence[str], push: str | None = None) -> Show:
         title, verdict = f"{title}, pushed by {words}", f"Both are pushed by {words}. "
     a, b = recordings
     verdict += f"A is {subjects[0].title}: {a.ending}. B is {subjects[1].title}: {b.ending}."
-    tables = [episode_table({"A": a, "B": b})]
     scores = [main_figures(one) for one in subjects]
-    if any(scores):
+    scored = force is None and any(scores)  # a score says nothing of a pushed episode
+    tables = [episode_table({"A": a, "B": b}, measures=not scored)]
+    if scored:
         tables.append(table_of(("score", "A", "B"), scores))
     return compose_pair(a, b, (first, second), title=title, verdict=verdict, tables=tables)
 
@@ -202,15 +203,15 @@ def names(subjects: Sequence[Subject], runs: Sequence[str]) -> list[str]:
     return [", ".join(filter(None, words)) for words in zip(*telling, strict=True)]
 
 
-def episode_table(recordings: Mapping[str, Recording]) -> Figures:
-    """The figures of single episodes, by their name."""
+def episode_table(recordings: Mapping[str, Recording], *, measures: bool = True) -> Figures:
+    """The figures of single episodes, by their name, with or without the task's measures."""
     columns = [
         {
             "ends": recording.ending,
             "after, s": f"{recording.duration:.2f}",
             "distance to the goal, m": f"{recording.goal_distance[-1]:.2f}",
             "reward, of the largest possible": f"{recording.outcome.normalized:.1%}",
-            **{name: number(value) for name, value in recording.measures.items()},
+            **{name: number(value) for name, value in recording.measures.items() if measures},
         }
         for recording in recordings.values()
     ]
