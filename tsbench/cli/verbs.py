@@ -488,6 +488,7 @@ def _view(words: Sequence[str]) -> None:
     if (options.what is None) == (options.compare is None):
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
     from tsbench.core.files import write_new
+    from tsbench.runs.progress import progress_bar
     from tsbench.viewer import film, page, serve
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
@@ -499,7 +500,8 @@ def _view(words: Sequence[str]) -> None:
     if options.html:
         write_new(options.html, page.render(shown).encode())
     if options.video:
-        film.write_video(shown, options.video)
+        with progress_bar(Console(stderr=True), "video") as progress:
+            film.write_video(shown, options.video, progress)
     if options.strip:
         film.write_strip(shown, options.strip)
     written = [str(path) for path in (options.html, options.video, options.strip) if path]
