@@ -343,7 +343,8 @@ def _unlink(app: Sphinx, name: str, source: list[str]) -> None:
         target = ROOT / link[2].partition("#")[0]
         return link[1] if target.is_dir() or target.suffix == ".md" else link[0]
 
-    source[0] = re.sub(r"(?<!!)\[([^]]*)\]\(\.\./([^)]*)\)", kept, source[0])
+    if "/" not in name:  # the pages in folders, which are cards, link within the site only
+        source[0] = re.sub(r"(?<!!)\[([^]]*)\]\(\.\./([^)]*)\)", kept, source[0])
 
 
 def _write_views(app: Sphinx, exception: Exception | None) -> None:

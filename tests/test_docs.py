@@ -218,7 +218,7 @@ def check_tsbench(words: list[str]) -> None:
 
 def check_make(words: list[str]) -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
-    line = ["make", "--dry-run", *words]
+    line = ["make", "--dry-run", "PYTHON=python3", *words]
     done = subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     if words[:1] == ["run"]:
