@@ -489,6 +489,7 @@ def _view(words: Sequence[str]) -> None:
     if (options.what is None) == (options.compare is None):
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
     from tsbench.core.files import write_new
+    from tsbench.runs.progress import progress_bar
     from tsbench.viewer import film, page, serve
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
@@ -500,7 +501,8 @@ def _view(words: Sequence[str]) -> None:
     if options.html:
         write_new(options.html, page.render(shown).encode())
     if options.video:
-        film.write_video(shown, options.video)
+        with progress_bar(Console(stderr=True), "video") as progress:
+            film.write_video(shown, options.video, progress)
     if options.strip:
         film.write_strip(shown, options.strip)
     written = [str(path) for path in (options.html, options.video, options.strip) if path]
@@ -644,7 +646,7 @@ def _export(words: Sequence[str]) -> None:
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
     parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=VECNORMALIZE)
     parser.add_argument("--activation", metavar="NAME", help="of a .pt file's hidden layers")
-    options = parser.parse_intermixed_args(words)
+    options = parser.parse_args(words)
     from tsbench import tasks
     from tsbench.core.files import check_new
     from tsbench.evaluation import deploy, export
