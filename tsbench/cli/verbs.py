@@ -424,8 +424,9 @@ def _policy(
     from tsbench.runs.directory import RunDirectory
 
     name = None if word is None else _task_name(word)
-    if trust_sb3 is not None and path.suffix != ".zip":
-        raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
+    for flag, given in (("--trust-sb3", trust_sb3), ("--vecnormalize", vecnormalize)):
+        if given is not None and path.suffix != ".zip":
+            raise TsbenchError(f"{flag} is for a stable-baselines3 .zip, not for {path}")
     if path.is_dir():
         run = RunDirectory(path)
         policy = run.policy()
@@ -652,10 +653,12 @@ def _export(words: Sequence[str]) -> None:
     from tsbench.evaluation import deploy, export
 
     check_new(options.directory, parents=True)
+    if options.activation is not None and options.model.suffix not in (".pt", ".pth"):
+        raise TsbenchError(f"--activation is for a .pt file of torch, not for {options.model}")
     if options.model.is_dir():
         if options.method is not None:
             raise TsbenchError("--method is for a policy of another library")
-        policy, task = _policy(options.model, options.task, options.trust_sb3)
+        policy, task = _policy(options.model, options.task, options.trust_sb3, options.vecnormalize)
         differences = deploy.write(policy, task, options.directory)
     else:
         if options.task is None:
