@@ -46,6 +46,28 @@ ConfigStore.instance().store(group="hydra/launcher", name="elsewhere", node=Conf
 
 
 RAY = "TSBENCH_TEST_RAY"  # set to test with Ray, in an environment that has hydra-ray-launcher
+POLICY = "policy.safetensors"
+
+
+def start(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """`tsbench run` in a folder, with the packages in its `plugins`."""
+    path = os.pathsep.join([str(folder / "plugins"), *sys.path])
+    return subprocess.run(
+        [sys.executable, "-m", "tsbench", "run", *words],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The second job of the sweeps, run by itself."""
+    folder = tmp_path_factory.mktemp("alone")
+    done = start(folder, *WORDS[:-1], "seed=1", "directory=run")
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
 
 
 @pytest.mark.parametrize(
@@ -56,7 +78,9 @@ RAY = "TSBENCH_TEST_RAY"  # set to test with Ray, in an environment that has hyd
         ("ray", ("+hydra.launcher.ray.init.num_cpus=2",)),
     ],
 )
-def test_jobs_in_other_processes(launcher: str, words: Sequence[str], tmp_path: Path) -> None:
+def test_jobs_in_other_processes(
+    launcher: str, words: Sequence[str], alone: Path, tmp_path: Path
+) -> None:
     """All jobs finish with their pages and with the bits of a run alone, and the error of the
     failed one is reported. A second start of the sweep does not repeat what is finished."""
     if launcher == "joblib":
@@ -73,17 +97,8 @@ def test_jobs_in_other_processes(launcher: str, words: Sequence[str], tmp_path: 
     (tmp_path / places[0]).mkdir(parents=True)
     (tmp_path / places[0] / "notes.txt").touch()
 
-    def start(*given: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "tsbench", "run", *given],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join([str(plugins), *sys.path])},
-            capture_output=True,
-            text=True,
-        )
-
     sweep = ("-m", f"hydra/launcher={launcher}", *words, *WORDS)
-    done = start(*sweep)
+    done = start(tmp_path, *sweep)
     line = f"{places[0]} holds other files and nothing is overwritten: "
     assert done.returncode == 2
     assert line in done.stderr.splitlines()[-1]
@@ -92,11 +107,8 @@ def test_jobs_in_other_processes(launcher: str, words: Sequence[str], tmp_path: 
     assert (finished / "report.html").exists()
     written = (finished / "score.json").stat().st_mtime_ns
     (tmp_path / places[0] / "notes.txt").unlink()
-    again = start(*sweep)
+    again = start(tmp_path, *sweep)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / places[0] / "score.json").exists()
     assert (finished / "score.json").stat().st_mtime_ns == written
-    alone = start(*WORDS[:-1], "seed=1", "directory=alone")
-    assert alone.returncode == 0, alone.stderr
-    policy = "policy.safetensors"
-    assert (finished / policy).read_bytes() == (tmp_path / "alone" / policy).read_bytes()
+    assert (finished / POLICY).read_bytes() == (alone / POLICY).read_bytes()
