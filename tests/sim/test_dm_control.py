@@ -8,6 +8,7 @@ import unittest
 from collections.abc import Callable
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from dm_control.mujoco.wrapper import enable_timer
@@ -254,6 +255,26 @@ def test_a_state_before_the_first_reset() -> None:
     made.physics.set_state(reached.physics.get_state())
     given = actions(made, 3, seed=1)
     assert trace(made, given) == trace(reached, given)
+
+
+def test_mujocos_own_signatures() -> None:
+    """They set that part of mujoco's state; the task's clock and memory stay."""
+    env, other = (tsbench.load("laikago_walk") for _ in range(2))
+    given = actions(env, 6)
+    for one in (env, other):
+        one.reset()
+        trace(one, given[:3])
+    clock, position = env.task.state.time.copy(), env.physics.data.qpos.copy()
+    part = int(mujoco.mjtState.mjSTATE_QVEL)
+    still = np.zeros_like(env.physics.get_state(part))
+    env.physics.set_state(still, part)
+    other.physics.data.qvel[:] = 0.0
+    other.physics.forward()
+    np.testing.assert_array_equal(values_now(env), values_now(other))
+    np.testing.assert_array_equal(env.task.state.time, clock)
+    np.testing.assert_array_equal(env.physics.data.qpos, position)
+    assert not env.task.state.joint_velocity.any()
+    assert trace(env, given[3:]) == trace(other, given[3:])
 
 
 @pytest.mark.parametrize(
