@@ -348,6 +348,7 @@ def test_a_copied_environment_goes_on_alike(
     trace(env, given[:5])
     twin = copied(env)
     assert trace(twin, given[5:]) == trace(env, given[5:])
+    assert twin.control_timestep() == env.control_timestep() == twin.task.mdp.timestep
     twin.physics.set_state(env.physics.get_state())
     assert twin.task.random.normal() == env.task.random.normal()
     physics = env.physics.copy()  # mere physics
