@@ -45,6 +45,7 @@ def test_the_wheel_holds_the_data(wheel: Path) -> None:
     for path in models:
         assert (package / "models" / path.name).read_bytes() == path.read_bytes()
     assert (package / "leaderboards" / "README.md").is_file()
+    assert (package / "py.typed").is_file()
     assert (package / "viewer" / "page.html").is_file()
     assert (package / "viewer" / "paper" / "page.html").is_file()
     assert {path.stem for path in (package / "references").iterdir()} <= set(tasks.names())
