@@ -8,7 +8,6 @@ time_step = environment.reset()
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Literal
 
 from tsbench.core.errors import TsbenchError, unknown
@@ -27,17 +26,29 @@ if TYPE_CHECKING:
     from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.push import Push
 
-choose_backend()
+    __version__: str
 
-try:
-    __version__ = version("tsbench")
-except PackageNotFoundError:  # a checkout on the path that was never installed
-    __version__ = "0+unknown"
+choose_backend()
 
 __all__ = ["TsbenchError", "evaluate", "list_methods", "list_tasks", "load", "load_batched"]
 
 Variant = Literal["planning", "imitation"]
 VARIANTS: tuple[Variant, ...] = ("planning", "imitation")
+
+
+if not TYPE_CHECKING:  # a type checker would take it for a definition of every name
+
+    def __getattr__(name: str) -> str:
+        if name != "__version__":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from tsbench.core import plugins  # takes longer than `tsbench --help` may
+
+        return plugins.own().version
+
+
+def __dir__() -> list[str]:
+    """What a user may use: the public names, without what this file itself imports."""
+    return [*__all__, "__version__"]
 
 
 def list_tasks() -> tuple[str, ...]:
@@ -127,6 +138,7 @@ def evaluate(
     *,
     protocol: str = "v1",
     threads: int | None = None,
+    progress: bool = True,
 ) -> Score:
     """Scores a policy by an evaluation protocol (`tsbench/evaluation/protocol.py`).
 
@@ -138,6 +150,7 @@ def evaluate(
         task: its name.
         protocol: "v1", or "smoke" for a first look that cannot be ranked.
         threads: CPU threads of the physics; None takes all cores. The score does not depend on it.
+        progress: whether a terminal shows how far the evaluation is.
 
     Raises:
         TsbenchError: a name is unknown, or the policy is for another task or does not fit.
@@ -149,6 +162,7 @@ def evaluate(
     from tsbench.evaluation import foreign, references
     from tsbench.evaluation import protocol as protocols
     from tsbench.evaluation.evaluate import evaluate as score
+    from tsbench.runs.progress import progress_bar
 
     made = tasks.make(task)
     if protocol not in protocols.PROTOCOLS:
@@ -163,7 +177,10 @@ def evaluate(
         else:
             kind = type(policy).__name__
             raise TsbenchError(f"a policy must be a model, a file or a function, not {kind}")
-    return score(policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads)
+    with progress_bar(None, "evaluate", shown=progress) as told:
+        return score(
+            policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads, progress=told
+        )
 
 
 def _variant(
