@@ -16,7 +16,7 @@ from tsbench.core.errors import TsbenchError
 from tsbench.leaderboard import kept
 
 VERSIONS = ("mujoco", "dm-control", "gymnasium", "numpy", "torch", "rsl-rl-lib")
-FOR_WORK_ON_TSBENCH = ("bench", "dev")  # extras that users do without
+FOR_DEVELOPERS = ("bench", "dev")  # extras that users do without
 _REQUIREMENT = re.compile(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]")
 GPU = "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else '')"
 MISSING = "missing"
@@ -32,8 +32,7 @@ def findings() -> Iterator[tuple[str, str]]:
     yield "GPU", _gpu()
     for state, names in _extras().items():
         yield f"extras {state}", names
-    names = tasks.names()
-    yield "tasks", f"{len(names)}, and {len(kept.entries())} kept entries"
+    yield "tasks", f"{len(tasks.names())}, and {len(kept.entries())} kept entries"
     others = sorted(str(one) for one in plugins.providers() if one != plugins.own())
     yield "plug-ins", ", ".join(others) or "none"
     for line in tasks.refused():
@@ -77,7 +76,7 @@ def _extras() -> dict[str, str]:
     """The installed extras and the others, with how to install them."""
     parts: dict[str, list[str]] = {}
     for line in requires(plugins.OWN) or ():
-        if (match := _REQUIREMENT.match(line)) and match[2] not in FOR_WORK_ON_TSBENCH:
+        if (match := _REQUIREMENT.match(line)) and match[2] not in FOR_DEVELOPERS:
             parts.setdefault(match[2], []).append(_version(match[1]))
     missing = [name for name, versions in parts.items() if MISSING in versions]
     there = [name for name in parts if name not in missing]

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tsbench.cli import places
-from tsbench.cli.help import fitted
 from tsbench.cli.streams import loading, open_closed, warnings_as_usual
+from tsbench.cli.usage import fitted
 from tsbench.core.errors import Stopped, TsbenchError, nearest, unknown
 from tsbench.gl import draw_nothing, find_working_backend
 
