@@ -7,6 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tsbench.cli.launch import directory
+from tsbench.runs import config
+
 WORDS = [
     "task=rocket_navigation",
     "budget=smoke",
@@ -47,10 +50,8 @@ def test_jobs_in_another_process(tmp_path: Path) -> None:
     plugins = tmp_path / "plugins"
     (plugins / "hydra_plugins").mkdir(parents=True)
     (plugins / "hydra_plugins" / "elsewhere.py").write_text(PLUGIN)
-    places = [
-        f"runs/rocket_navigation/monolithic/seed{seed}-smoke,{','.join(WORDS[4:6])}"
-        for seed in (0, 1)
-    ]
+    words = [[*WORDS[:-1], f"seed={seed}"] for seed in (0, 1)]
+    places = [str(directory(config.compose(one), one)) for one in words]
     (tmp_path / places[0]).mkdir(parents=True)
     (tmp_path / places[0] / "notes.txt").touch()
     path = os.pathsep.join([str(plugins), *sys.path])
