@@ -270,6 +270,12 @@ def check_torchrun(words: list[str]) -> None:
     check_python(words[words.index("-m") :])
 
 
+def check_sbatch(words: list[str]) -> None:
+    place = next(i for i, word in enumerate(words) if not word.startswith("-"))
+    assert (ROOT / words[place]).is_file()
+    check_tsbench([word.replace("%a", "0") for word in words[place + 1 :]])
+
+
 CHECKS: dict[str, Callable[[list[str]], None]] = {
     "tsbench": check_tsbench,
     "make": check_make,
@@ -278,6 +284,7 @@ CHECKS: dict[str, Callable[[list[str]], None]] = {
     "python3": check_python,
     "pytest": check_pytest,
     "bash": check_bash,
+    "sbatch": check_sbatch,
     "torchrun": check_torchrun,
     ".ci/run": lambda words: None,
 }

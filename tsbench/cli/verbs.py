@@ -34,6 +34,7 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
+  loggers=[...]    what shows the training: tensorboard, wandb, mlflow ([tensorboard])
   device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
   deterministic=true
                    the same bits each time on a GPU, for more time
@@ -471,8 +472,9 @@ def _policy(
     from tsbench.runs.directory import RunDirectory
 
     name = None if word is None else _task_name(word)
-    if trust_sb3 is not None and path.suffix != ".zip":
-        raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
+    for flag, given in (("--trust-sb3", trust_sb3), ("--vecnormalize", vecnormalize)):
+        if given is not None and path.suffix != ".zip":
+            raise TsbenchError(f"{flag} is for a stable-baselines3 .zip, not for {path}")
     if path.is_dir():
         run = RunDirectory(path)
         policy = run.policy()
@@ -736,16 +738,18 @@ def _export(words: Sequence[str]) -> None:
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
     parser.add_argument("--vecnormalize", type=places.path, metavar="FILE", help=VECNORMALIZE)
     parser.add_argument("--activation", metavar="NAME", help="of a .pt file's hidden layers")
-    options = parser.parse_intermixed_args(words)
+    options = parser.parse_args(words)
     from tsbench import tasks
     from tsbench.core.files import check_new
     from tsbench.evaluation import deploy, export
 
     check_new(options.directory, parents=True)
+    if options.activation is not None and options.model.suffix not in (".pt", ".pth"):
+        raise TsbenchError(f"--activation is for a .pt file of torch, not for {options.model}")
     if options.model.is_dir():
         if options.method is not None:
             raise TsbenchError("--method is for a policy of another library")
-        policy, task = _policy(options.model, options.task, options.trust_sb3)
+        policy, task = _policy(options.model, options.task, options.trust_sb3, options.vecnormalize)
         differences = deploy.write(policy, task, options.directory)
     else:
         if options.task is None:
