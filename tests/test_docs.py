@@ -313,17 +313,13 @@ def test_links_and_named_files_exist(page: Path) -> None:
         if not target.startswith("https://") and target.partition("/")[0] not in (*MADE, "tasks"):
             assert (page.parent / target).exists(), target
     for name in re.findall(r"`((?:tests|benchmarks|tsbench|examples)/[\w/.-]+)`", text):
-        assert (
-            name.startswith("tsbench/tasks/NAME")
-            or "puck" in name
-            or "NAME" in name
-            or (ROOT / name).exists()
-        ), name
+        stands_for_yours = "NAME" in name or page.stem == "extending"
+        assert stands_for_yours or (ROOT / name).exists(), name
 
 
 def test_the_readme_links_every_page() -> None:
     readme = PAGES[0].read_text(encoding="utf-8")
-    pages = [f"docs/{page.name}" for page in PAGES if page.parent.name == "docs"]
+    pages = [f"docs/{page.name}" for page in PAGES if page.parent != ROOT]
     assert [page for page in pages if f"]({page})" not in readme] == []
 
 
@@ -349,7 +345,6 @@ def test_each_task_and_method_has_a_card(tmp_path: Path) -> None:
         for constant in task.constants().keys() - {"name"}:
             assert f"| `{constant}` | " in card
         assert f"{task.observation_size} numbers" in card
-        assert f"[laikago_trot]({name}.md)" not in card
         entries = ROOT / "leaderboards" / "v1" / name
         for entry in entries.iterdir() if entries.is_dir() else ():
             assert f"[{entry.name}](../methods/" in card
