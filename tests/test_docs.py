@@ -35,6 +35,7 @@ import yaml
 
 from tsbench import cli, methods, tasks
 from tsbench.cli import verbs
+from tsbench.core.errors import TsbenchError
 from tsbench.runs import config
 
 ROOT = Path(__file__).parents[1]
@@ -285,7 +286,7 @@ CHECKS: dict[str, Callable[[list[str]], None]] = {
 @pytest.mark.parametrize("words", ["view RUN --films x", "evaluate", "paint RUN"])
 @pytest.mark.usefixtures("parsing")
 def test_a_wrong_command_would_be_noticed(words: str) -> None:
-    with pytest.raises((AssertionError, verbs.TsbenchError)):
+    with pytest.raises((AssertionError, TsbenchError)):
         check_tsbench(words.split())
 
 

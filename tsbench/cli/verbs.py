@@ -75,6 +75,7 @@ options:
 """
 
 JSON_HELP = "write what is shown to a new JSON file too"
+VECNORMALIZE = "the model's VecNormalize, saved beside the .zip; loading it runs code too"
 PICTURES = ("--video", "--strip")  # options that need OpenGL
 
 
@@ -323,6 +324,7 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="ALGORITHM",
         help="the algorithm that saved the .zip, which can run any code when it is loaded",
     )
+    parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=VECNORMALIZE)
     options = parser.parse_args(words)
     from tsbench import tasks
     from tsbench.cli import tables
@@ -336,7 +338,7 @@ def _evaluate(words: Sequence[str]) -> int:
     from tsbench.runs.progress import progress_bar
 
     path = Path(options.policy)
-    policy, task = _policy(path, options.task, options.trust_sb3)
+    policy, task = _policy(path, options.task, options.trust_sb3, options.vecnormalize)
     run = directory.RunDirectory(path)
     kept = run.record() if run.finished else None
     name = options.protocol or (kept.score.protocol if kept else V1.name)
@@ -402,13 +404,16 @@ def _engine(physics: str | None) -> Any:
     return Physics
 
 
-def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
+def _policy(
+    path: Path, word: str | None, trust_sb3: str | None, vecnormalize: Path | None = None
+) -> tuple[Any, Any]:
     """A policy, and the task in which it is evaluated.
 
     Args:
         path: a run directory, a policy file or the name of a reference policy.
         word: task=NAME, or None.
         trust_sb3: the stable-baselines3 algorithm that saved the file, or None.
+        vecnormalize: the file of that model's VecNormalize, or None.
 
     Raises:
         TsbenchError: the policy does not exist, or `word` is missing or wrong.
@@ -432,7 +437,8 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
             raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
         raise TsbenchError(f"no run directory {path}")
     task = tasks.checked(name)
-    return references.named(path, task) or foreign.load(path, task, trust_sb3), task
+    named = references.named(path, task)
+    return named or foreign.load(path, task, trust_sb3, vecnormalize), task
 
 
 def _task_name(word: str) -> str:
@@ -482,6 +488,7 @@ def _view(words: Sequence[str]) -> None:
     if (options.what is None) == (options.compare is None):
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
     from tsbench.core.files import write_new
+    from tsbench.runs.progress import progress_bar
     from tsbench.viewer import film, page, serve
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
@@ -493,7 +500,8 @@ def _view(words: Sequence[str]) -> None:
     if options.html:
         write_new(options.html, page.render(shown).encode())
     if options.video:
-        film.write_video(shown, options.video)
+        with progress_bar(Console(stderr=True), "video") as progress:
+            film.write_video(shown, options.video, progress)
     if options.strip:
         film.write_strip(shown, options.strip)
     written = [str(path) for path in (options.html, options.video, options.strip) if path]
@@ -628,35 +636,47 @@ def _bench(words: Sequence[str]) -> None:
 
 def _export(words: Sequence[str]) -> None:
     parser = _parser("export", json=False)
-    what = "an .onnx file, a stable-baselines3 .zip, or a .pt file of a state dict"
+    what = "a run or policy directory, .onnx file, stable-baselines3 .zip, or .pt file of torch"
     parser.add_argument("model", type=Path, metavar="MODEL", help=what)
-    parser.add_argument("task", metavar="task=NAME", help="that the policy is for")
+    for_task = "that the policy is for, if it does not say so"
+    parser.add_argument("task", nargs="?", metavar="task=NAME", help=for_task)
     parser.add_argument("directory", type=Path, metavar="DIRECTORY", help="a new one")
-    parser.add_argument("--method", required=True, metavar="NAME", help="that made the policy")
+    parser.add_argument("--method", metavar="NAME", help="that made the policy of another library")
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
-    normalise = "VecNormalize's statistics beside a .zip; loading them runs code too"
-    parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=normalise)
+    parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=VECNORMALIZE)
     parser.add_argument("--activation", metavar="NAME", help="of a .pt file's hidden layers")
-    options = parser.parse_args(words)
+    options = parser.parse_intermixed_args(words)
     from tsbench import tasks
     from tsbench.core.files import check_new
-    from tsbench.evaluation import export
+    from tsbench.evaluation import deploy, export
 
-    task = tasks.make(_task_name(options.task))
     check_new(options.directory, parents=True)
-    found = export.read(
-        options.model,
-        task,
-        algorithm=options.trust_sb3,
-        vecnormalize=options.vecnormalize,
-        activation=options.activation,
-    )
-    policy, difference = export.policy_of(found, task, options.method)
-    options.directory.mkdir(parents=True)
-    policy.save(options.directory)
-    sys.stdout.write(
-        f"{options.directory}: actions differ by at most {difference:.1g} from the model's\n"
-    )
+    if options.model.is_dir():
+        if options.method is not None:
+            raise TsbenchError("--method is for a policy of another library")
+        policy, task = _policy(options.model, options.task, options.trust_sb3)
+        differences = deploy.write(policy, task, options.directory)
+    else:
+        if options.task is None:
+            raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
+        if options.method is None:
+            raise TsbenchError("--method NAME is missing, the name of what made the policy")
+        task = tasks.make(_task_name(options.task))
+        found = export.read(
+            options.model,
+            task,
+            algorithm=options.trust_sb3,
+            vecnormalize=options.vecnormalize,
+            activation=options.activation,
+        )
+        policy, _ = export.policy_of(found, task, options.method)
+        differences = deploy.write(policy, task, options.directory, found.answer)
+    for name, difference in differences.items():
+        about = f" (opset {deploy.OPSET}, any number of rows)" if name == deploy.ONNX_FILE else ""
+        sys.stdout.write(
+            f"{options.directory / name}{about}: "
+            f"actions differ by at most {difference:.1g} from the model's\n"
+        )
 
 
 BOARD = Path("leaderboards")
@@ -864,7 +884,7 @@ VERBS = {
     "tune": Verb("search for good settings of a method, shared by processes", _tune),
     "collect": Verb("keep the scores, curves and best policies of many runs as data", _collect),
     "figures": Verb("make the paper's figures and its table again, from runs or results", _figures),
-    "export": Verb("write a policy of another library as tsbench's own file", _export),
+    "export": Verb("write a policy for robots, or one of another library as tsbench's", _export),
     "submit": Verb("pack runs into an entry of the leaderboard", _submit),
     "verify": Verb("check whether entries of the leaderboard hold what they claim", _verify),
     "leaderboard": Verb("show the leaderboard: as tables, or as a site", _leaderboard),

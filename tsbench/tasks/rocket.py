@@ -301,7 +301,7 @@ class Rocket(Plannable[RocketState]):
             reward: np.ndarray = self.reward(state, state.time, state)
             return reward
 
-        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth, still=still)
+        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth, still=still, robot="rocket")
 
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """At the origin, at rest, upright (P).
