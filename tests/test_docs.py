@@ -2,8 +2,8 @@
 
 The second word of a block's info string says what is done with it here:
 
-- `sh run`: its commands are run. RUN is a run with `budget=smoke`, which the README's first block
-  makes.
+- `sh run`: its commands are run, in a directory with the board in it. RUN is a run with
+  `budget=smoke`, which the README's first block makes.
 - `sh check`: its commands are checked, but take too long, need a network or wait for someone. A
   training's configuration is composed; the words of every other verb are parsed; make says what it
   would do; files, modules and extras have to exist, and scripts have to know the flags.
@@ -144,6 +144,7 @@ def test_commands_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").symlink_to(home / "runs")
+    (tmp_path / "leaderboards").symlink_to(ROOT / "leaderboards")
     for words in commands(block.text):
         if words[:2] == ["make", "run"]:  # made by `home`
             assert words == commands(next(b.text for b in COMMANDS if b.how == "run"))[0]
@@ -160,6 +161,7 @@ PYTHON = [page for page in PAGES if any(b.language == "python" for b in BLOCKS i
 )
 def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "leaderboards").symlink_to(ROOT / "leaderboards")
     names: dict[str, Any] = {"__name__": page.stem}
     for block in BLOCKS:
         if block.page == page and block.language == "python":
@@ -177,13 +179,16 @@ class ParsedError(Exception):
 @pytest.fixture
 def parsing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A verb stops after it has parsed its words."""
-    parse = verbs.Parser.parse_args
+    for name in ("parse_args", "parse_intermixed_args"):
+        monkeypatch.setattr(verbs.Parser, name, _stopping(getattr(verbs.Parser, name)))
 
-    def stop(parser: verbs.Parser, words: Any = None, namespace: Any = None) -> Any:
-        parse(parser, words, namespace)
+
+def _stopping(parse: Callable[..., Any]) -> Callable[..., Any]:
+    def parse_and_stop(*arguments: Any) -> Any:
+        parse(*arguments)
         raise ParsedError
 
-    monkeypatch.setattr(verbs.Parser, "parse_args", stop)
+    return parse_and_stop
 
 
 @pytest.mark.parametrize("block", [b for b in COMMANDS if b.how in ("check", "elsewhere")], ids=str)
@@ -203,7 +208,7 @@ def check_tsbench(words: list[str]) -> None:
     verb, rest = words[0], words[1:]
     assert verb in verbs.VERBS
     if verb in ("run", "tune"):
-        own = re.compile(r"-m|--multirun|--best|trials=\d+|study=.*")
+        own = re.compile(r"-m|--multirun|--best|trials=\d+|study=.*|\+?hydra[./].*")
         given = [word for word in rest if not own.fullmatch(word)]
         if given[0].startswith("resume="):
             assert len(given) == 1
@@ -266,6 +271,13 @@ def check_bash(words: list[str]) -> None:
     assert made or (ROOT / words[0]).is_file()
 
 
+def check_sbatch(words: list[str]) -> None:
+    options = [word for word in words if word.startswith("--")]
+    script, *given = [word.replace("%a", "0") for word in words if word not in options]
+    assert (ROOT / script).is_file()
+    check_tsbench(given)
+
+
 def check_torchrun(words: list[str]) -> None:
     check_python(words[words.index("-m") :])
 
@@ -278,6 +290,7 @@ CHECKS: dict[str, Callable[[list[str]], None]] = {
     "python3": check_python,
     "pytest": check_pytest,
     "bash": check_bash,
+    "sbatch": check_sbatch,
     "torchrun": check_torchrun,
     ".ci/run": lambda words: None,
 }
