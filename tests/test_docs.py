@@ -271,15 +271,14 @@ def check_bash(words: list[str]) -> None:
     assert made or (ROOT / words[0]).is_file()
 
 
-def check_sbatch(words: list[str]) -> None:
-    options = [word for word in words if word.startswith("--")]
-    script, *given = [word.replace("%a", "0") for word in words if word not in options]
-    assert (ROOT / script).is_file()
-    check_tsbench(given)
-
-
 def check_torchrun(words: list[str]) -> None:
     check_python(words[words.index("-m") :])
+
+
+def check_sbatch(words: list[str]) -> None:
+    place = next(i for i, word in enumerate(words) if not word.startswith("-"))
+    assert (ROOT / words[place]).is_file()
+    check_tsbench([word.replace("%a", "0") for word in words[place + 1 :]])
 
 
 CHECKS: dict[str, Callable[[list[str]], None]] = {

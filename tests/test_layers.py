@@ -57,6 +57,8 @@ ONLY_IN: dict[str, set[str]] = {
     "matplotlib": {"viewer"},
     "pytest": {"testing"},
     "tensorboard": {"runs.events"},
+    "wandb": {"runs.events"},
+    "mlflow": {"runs.events"},
     "rich": {"runs.progress", "runs.workspace", "runs.execute", "cli", "bench"},
 }
 # The rooms that may delay an import until they need it.

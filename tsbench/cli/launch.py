@@ -37,7 +37,7 @@ from tsbench.viewer.report import write_pages
 RUNS = Path("runs")
 LONGEST_NAME = 200  # characters; file systems allow 255 bytes
 CHECKED_JOBS = 1000  # jobs of a sweep checked before it starts; later ones when they start
-PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads", "checkpoint")
+PART_OF_THE_NAME = ("task", "method", "seed", "budget", *config.ELSEWHERE)
 RESUME = "resume="
 
 

@@ -33,6 +33,7 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
+  loggers=[...]    what shows the training: tensorboard, wandb, mlflow ([tensorboard])
   device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
   deterministic=true
                    the same bits each time on a GPU, for more time
@@ -645,7 +646,7 @@ def _export(words: Sequence[str]) -> None:
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
     parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=VECNORMALIZE)
     parser.add_argument("--activation", metavar="NAME", help="of a .pt file's hidden layers")
-    options = parser.parse_intermixed_args(words)
+    options = parser.parse_args(words)
     from tsbench import tasks
     from tsbench.core.files import check_new
     from tsbench.evaluation import deploy, export

@@ -41,6 +41,7 @@ SEEDS = 2**32  # numpy and torch both take 32 bits
 CONFIGURATIONS = "tsbench.conf"
 VERSION_BASE = "1.3"  # the defaults of this Hydra release
 OPEN_MAPPINGS = ("task.training.", "task.constants.", "task.gpu.")
+ELSEWHERE = ("directory", "threads", "checkpoint", "loggers")  # keys that change no result
 DEVICES = "cpu, cuda, cuda:N, auto, warp"
 DEVICE = re.compile(r"cpu|cuda(:\d{1,3})?|auto|warp")
 
@@ -94,6 +95,7 @@ class RunConfig:
         checkpoint: seconds of training between checkpoints.
         device: "cpu", "cuda", "cuda:N", "warp" (a GPU's code on a CPU, for tests), or "auto".
         deterministic: whether a device other than the CPU has to give the same bits each time.
+        loggers: what shows the figures of the training elsewhere (`runs.events.LOGGERS`).
 
     Raises:
         TsbenchError: a value is missing, unknown or out of range.
@@ -108,12 +110,12 @@ class RunConfig:
     checkpoint: float = 30.0
     device: str = "cpu"
     deterministic: bool = False
+    loggers: tuple[str, ...] = ("tensorboard",)
 
     @property
     def identity(self) -> dict[str, Any]:
         """The part of the configuration that determines a run's results."""
-        elsewhere = ("directory", "threads", "checkpoint")
-        return {name: value for name, value in asdict(self).items() if name not in elsewhere}
+        return {name: value for name, value in asdict(self).items() if name not in ELSEWHERE}
 
     def __post_init__(self) -> None:
         if not isinstance(self.method.get("name"), str):

@@ -30,7 +30,7 @@ from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import parse_json, read_file, write_whole
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
-from tsbench.runs.config import RunConfig
+from tsbench.runs.config import ELSEWHERE, RunConfig
 from tsbench.runs.directory import MAX_SCORE, RunDirectory, Stage, read_metrics
 
 ROWS = "runs.jsonl"
@@ -43,7 +43,6 @@ CONSTANTS = "task.constants."
 # Limits of the files, in bytes. The curves of a stage are 2.4 KB.
 MAX_ROWS = 2_000 * MAX_SCORE
 MAX_CURVES = 2**28
-ELSEWHERE = ("directory", "threads", "checkpoint")  # words that change no result
 
 
 @dataclass(frozen=True)
