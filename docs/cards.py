@@ -14,6 +14,7 @@ import inspect
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,9 +53,15 @@ def setup(app: Sphinx) -> dict[str, bool]:
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
+@cache
+def board() -> tuple[list[Table], list[str]]:
+    """The tables of the board, and why an entry is in none."""
+    return page.tables(BOARD)
+
+
 def write_pages(folder: Path) -> list[Path]:
     """Writes the cards and the board's tables below a folder, and returns the files."""
-    found, left_out = page.tables(BOARD)
+    found, left_out = board()
     before = (
         "# The board\n\nAll entries of `leaderboards/v1`, best first, with the policies `zero` and "
         "`random` beside them. [leaderboard.md](leaderboard.md) says how to submit one, and "
@@ -146,7 +153,7 @@ def method_card(name: str, found: Sequence[Table]) -> str:
 
 def results() -> str:
     """README.md's table: the best entry of each task."""
-    found, _ = page.tables(BOARD)
+    found, _ = board()
     head = ("task", "best entry", *RESULT_COLUMNS, "best plan")
     rows = [
         (table.task, row.name, *_figures(row), number(table.best))
@@ -355,7 +362,7 @@ def _write_views(app: Sphinx, exception: Exception | None) -> None:
 
     folder = Path(app.outdir) / "views"
     folder.mkdir(exist_ok=True)
-    for table in page.tables(BOARD)[0]:
+    for table in board()[0]:
         if (row := _shown(table)) is not None:
             show = subject(str(row.entry.kept[0].run.path)).show(None)
             write_whole(folder / f"{table.task}.html", viewer.render(show).encode())
