@@ -28,7 +28,7 @@ from tsbench.core.task import MDP, Plannable, Task
 from tsbench.core.words import duration, number
 from tsbench.leaderboard import page
 from tsbench.leaderboard.page import Row, Table, short
-from tsbench.runs import config
+from tsbench.runs import schema
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -255,7 +255,7 @@ def _variants(task: Plannable[Any]) -> list[str]:
 def _budgets(name: str) -> str:
     rows = [
         (f"`{budget}`", f"{steps.plan:,}", f"{steps.act:,}")
-        for budget, steps in config.budgets(name).items()
+        for budget, steps in schema.budgets(name).items()
     ]
     return _table(("budget", "environment steps to plan with", "to act with"), rows)
 

@@ -69,8 +69,8 @@ def test_jobs_in_other_processes(launcher: str, words: Sequence[str], tmp_path: 
     plugins = tmp_path / "plugins"
     (plugins / "hydra_plugins").mkdir(parents=True)
     (plugins / "hydra_plugins" / "elsewhere.py").write_text(PLUGIN)
-    words = [[*WORDS[:-1], f"seed={seed}"] for seed in (0, 1)]
-    places = [str(directory(config.compose(one), one)) for one in words]
+    jobs = [[*WORDS[:-1], f"seed={seed}"] for seed in (0, 1)]
+    places = [str(directory(config.compose(job), job)) for job in jobs]
     (tmp_path / places[0]).mkdir(parents=True)
     (tmp_path / places[0] / "notes.txt").touch()
 
