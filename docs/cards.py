@@ -28,7 +28,7 @@ from tsbench.core.task import MDP, Plannable, Task
 from tsbench.core.words import duration, number
 from tsbench.leaderboard import page
 from tsbench.leaderboard.page import Row, Table, short
-from tsbench.runs import schema
+from tsbench.runs import config, schema
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
