@@ -28,7 +28,7 @@ from tsbench.core.task import MDP, Plannable, Task
 from tsbench.core.words import duration, number
 from tsbench.leaderboard import page
 from tsbench.leaderboard.page import Row, Table, short
-from tsbench.runs import config, schema
+from tsbench.runs import schema
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -135,7 +135,7 @@ def method_card(name: str, found: Sequence[Table]) -> str:
         _yaml("method", name),
         f"Its kinds of training stages: {stages}. They take `task.training.STAGE.KEY=VALUE`.",
     ]
-    if name in config.names("search"):
+    if name in schema.names("search"):
         parts += ["## What is tuned", "`tsbench tune` searches these:", _yaml("search", name)]
     parts += ["## Results"]
     head = ("task", "entry", *RESULT_COLUMNS)
