@@ -14,6 +14,7 @@ import inspect
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ from tsbench.core.task import MDP, Plannable, Task
 from tsbench.core.words import duration, number
 from tsbench.leaderboard import page
 from tsbench.leaderboard.page import Row, Table, short
-from tsbench.runs import config
+from tsbench.runs import schema
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -52,9 +53,15 @@ def setup(app: Sphinx) -> dict[str, bool]:
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
+@cache
+def board() -> tuple[list[Table], list[str]]:
+    """The tables of the board, and why an entry is in none."""
+    return page.tables(BOARD)
+
+
 def write_pages(folder: Path) -> list[Path]:
     """Writes the cards and the board's tables below a folder, and returns the files."""
-    found, left_out = page.tables(BOARD)
+    found, left_out = board()
     before = (
         "# The board\n\nAll entries of `leaderboards/v1`, best first, with the policies `zero` and "
         "`random` beside them. [leaderboard.md](leaderboard.md) says how to submit one, and "
@@ -128,7 +135,7 @@ def method_card(name: str, found: Sequence[Table]) -> str:
         _yaml("method", name),
         f"Its kinds of training stages: {stages}. They take `task.training.STAGE.KEY=VALUE`.",
     ]
-    if name in config.names("search"):
+    if name in schema.names("search"):
         parts += ["## What is tuned", "`tsbench tune` searches these:", _yaml("search", name)]
     parts += ["## Results"]
     head = ("task", "entry", *RESULT_COLUMNS)
@@ -146,7 +153,7 @@ def method_card(name: str, found: Sequence[Table]) -> str:
 
 def results() -> str:
     """README.md's table: the best entry of each task."""
-    found, _ = page.tables(BOARD)
+    found, _ = board()
     head = ("task", "best entry", *RESULT_COLUMNS, "best plan")
     rows = [
         (table.task, row.name, *_figures(row), number(table.best))
@@ -248,7 +255,7 @@ def _variants(task: Plannable[Any]) -> list[str]:
 def _budgets(name: str) -> str:
     rows = [
         (f"`{budget}`", f"{steps.plan:,}", f"{steps.act:,}")
-        for budget, steps in config.budgets(name).items()
+        for budget, steps in schema.budgets(name).items()
     ]
     return _table(("budget", "environment steps to plan with", "to act with"), rows)
 
@@ -355,7 +362,7 @@ def _write_views(app: Sphinx, exception: Exception | None) -> None:
 
     folder = Path(app.outdir) / "views"
     folder.mkdir(exist_ok=True)
-    for table in page.tables(BOARD)[0]:
+    for table in board()[0]:
         if (row := _shown(table)) is not None:
             show = subject(str(row.entry.kept[0].run.path)).show(None)
             write_whole(folder / f"{table.task}.html", viewer.render(show).encode())
