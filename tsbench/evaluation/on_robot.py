@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,21 @@ def _symlog(x: torch.Tensor) -> torch.Tensor:
     return x.sign() * x.abs().log1p()
 
 
-ENCODINGS = {"plain": _plain, "symlog": _symlog}
-ACTIVATIONS = {"elu": torch.nn.functional.elu, "relu": torch.relu, "tanh": torch.tanh}
-OUTPUTS = {"clip": _plain, "tanh": torch.tanh}
+Function = Callable[[torch.Tensor], torch.Tensor]
+ENCODINGS: dict[str, Function] = {"plain": _plain, "symlog": _symlog}
+ACTIVATIONS: dict[str, Function] = {
+    "elu": torch.nn.functional.elu,
+    "relu": torch.relu,
+    "tanh": torch.tanh,
+}
+OUTPUTS: dict[str, Function] = {"clip": _plain, "tanh": torch.tanh}
 
 
 class Policy(torch.nn.Module):
     """A multilayer perceptron with its observation normaliser: observation -> action."""
+
+    mean: torch.Tensor
+    scale: torch.Tensor
 
     def __init__(self, info: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> None:
         """
