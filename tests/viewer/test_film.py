@@ -133,7 +133,7 @@ def test_the_close_up_of_a_film_leaves_the_path_free(
     model = mujoco.MjModel.from_xml_string(ball)
     progress = np.linspace(0.0, 1.0, 60)
     qpos = np.zeros((60, 7))
-    qpos[:, 0], qpos[:, 3] = 30.0 * np.minimum(1.0, 1.5 * progress), 1.0
+    qpos[:, 0], qpos[:, 3] = 80.0 * np.minimum(1.0, 1.5 * progress), 1.0
     qpos[:, 2] = np.interp(progress, np.linspace(0.0, 1.0, len(heights)), heights)
     shown = Show(model, [Actor("executed", qpos, 0.1, EXECUTED_COLOUR, "")], "")
     with film.Camera(shown, (480, 270)) as camera:
