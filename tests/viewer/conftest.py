@@ -138,6 +138,11 @@ class Browser:
         self.call("Target.closeTarget", targetId=target)
         assert not unexpected
 
+    def go(self, address: str) -> None:
+        """Changes what stands behind the # of the page's address, and waits until it is drawn."""
+        self.ask(f"location.hash = {json.dumps(address)}")
+        self.ask(DRAWN)
+
     def ask(self, expression: str) -> Any:
         """The value of an expression in the page; waits for a promise."""
         result = self.call(

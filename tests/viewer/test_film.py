@@ -121,6 +121,30 @@ def test_the_parts_of_a_ghost_do_not_add_up() -> None:
     assert np.abs(one - many).mean() < 1.0
 
 
+@pytest.mark.parametrize(
+    ("heights", "place"),
+    [((0.0, 20.0), "below"), ((0.0, -20.0), "above"), ((0.0, 0.0, 22.0, -22.0), "nowhere")],
+)
+def test_the_close_up_of_a_film_leaves_the_path_free(
+    heights: tuple[float, ...], place: str
+) -> None:
+    """A flat flight to the upper right, to the lower right, and one that passes both corners."""
+    ball = "<mujoco><worldbody><body><freejoint/><geom size='.4'/></body></worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(ball)
+    progress = np.linspace(0.0, 1.0, 60)
+    qpos = np.zeros((60, 7))
+    qpos[:, 0], qpos[:, 3] = 80.0 * np.minimum(1.0, 1.5 * progress), 1.0
+    qpos[:, 2] = np.interp(progress, np.linspace(0.0, 1.0, len(heights)), heights)
+    shown = Show(model, [Actor("executed", qpos, 0.1, EXECUTED_COLOUR, "")], "")
+    with film.Camera(shown, (480, 270)) as camera:
+        picture = camera.frame(0.0)
+    white = np.all(picture == 255, axis=-1).sum(axis=1)
+    rows = np.flatnonzero(white > 100)  # its frame
+    assert len(rows) == (0 if place == "nowhere" else 4)
+    if place != "nowhere":
+        assert rows.mean() > 135 if place == "below" else rows.mean() < 135
+
+
 def test_the_end_of_a_film_is_drawn_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(BALL.format(more=""))
     qpos = np.zeros((11, 7))

@@ -117,32 +117,38 @@ def write(path: Path, show: Show, *, served: bool = False) -> str:
 def check_view(browser: Browser, url: str, name: str) -> None:
     """Checks the page on all screens: nothing is covered, nothing is cut."""
     for screen in SCREENS:
-        for time in (0, 1.1, 99):
-            with browser.open(f"{url}#t={time}", screen):
-                found: dict[str, Any] = browser.ask(BOXES)
-                if time == 99:
-                    browser.screenshot(f"{name}_{screen[0]}")
-                    places: list[Box] = browser.ask(PLACES)
-            regions = {box[0]: box for box in found["regions"]}
-            assert set(regions) == {"stage", "card", "bottom"}
-            assert found["over"] <= 0
-            assert not overlapping(found["regions"])
-            assert not overlapping(found["controls"])
-            for box in [*found["regions"], *found["controls"]]:
-                assert inside(box, found["screen"]), box
-            for box in found["over_picture"]:
-                assert inside(box, regions["stage"]), box
-            assert not overlapping(found["over_picture"]), screen
-            stage = regions["stage"]
-            assert stage[4] - stage[2] >= (240 if screen == PHONE else 160)
-            if screen != PHONE:
-                assert found["below"] <= 0, screen
-            if screen == WINDOW:
-                assert max(found["cut"]) <= 0, name
+        with browser.open(f"{url}#t=0", screen):
+            for address in ("t=0", "t=1.1", "t=99"):
+                browser.go(address)
+                check_boxes(browser.ask(BOXES), screen)
+            browser.screenshot(f"{name}_{screen[0]}")
+            found: dict[str, Any] = browser.ask(BOXES)
+            places: list[Box] = browser.ask(PLACES)
+        (stage,) = (box for box in found["regions"] if box[0] == "stage")
         for place in places:
             assert inside(place, stage), place
             for box in found["over_picture"]:
                 assert box[0] != "lens" or not inside(place, box), place
+
+
+def check_boxes(found: dict[str, Any], screen: tuple[int, int]) -> None:
+    """Checks what `BOXES` has found on a screen."""
+    regions = {box[0]: box for box in found["regions"]}
+    assert set(regions) == {"stage", "card", "bottom"}
+    assert found["over"] <= 0
+    assert not overlapping(found["regions"])
+    assert not overlapping(found["controls"])
+    for box in [*found["regions"], *found["controls"]]:
+        assert inside(box, found["screen"]), box
+    stage = regions["stage"]
+    assert stage[4] - stage[2] >= (240 if screen == PHONE else 160)
+    for box in found["over_picture"]:
+        assert inside(box, stage), box
+    assert not overlapping(found["over_picture"]), screen
+    if screen != PHONE:
+        assert found["below"] <= 0, screen
+    if screen == WINDOW:
+        assert max(found["cut"]) <= 0
 
 
 @pytest.mark.parametrize("name", tasks.names())
