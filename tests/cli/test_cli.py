@@ -104,8 +104,9 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["list", "more"], "unrecognized arguments: more (see tsbench list --help)"),
-        (["list", "--jsn", "x"], "unrecognized arguments: --jsn x"),
+        (["list", "more"], "unknown task 'more'"),
+        (["list", "one", "two"], "unrecognized arguments: two (see tsbench list --help)"),
+        (["list", "--jsn", "x"], "unrecognized arguments: --jsn (did you mean --json?)"),
         (["list", "--json", "/proc/none/x"], "/proc/none/x: No such file or directory"),
         (["list", "--json", "/dev/full"], "/dev/full exists and nothing is overwritten"),
         (["evaluate"], "the following arguments are required: POLICY_OR_RUN"),

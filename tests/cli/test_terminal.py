@@ -241,7 +241,7 @@ def test_scores_cut_no_name(width: int, invented_record: Callable[[str], Record]
         assert words in text
 
 
-@pytest.mark.parametrize("width", [40, 72, 99])
+@pytest.mark.parametrize("width", [40, 72, 100])
 @pytest.mark.parametrize("text", [verbs.RUN_HELP, verbs.TUNE_HELP, verbs._help()])
 def test_help_follows_the_width(text: str, width: int) -> None:
     fitted = usage.fitted(text, width)

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from textwrap import fill
 
-WIDEST = 99  # columns, in which the texts are written
+WIDEST = 100  # columns, in which the texts are written
 TERMS = 0.4  # of the width may be for the terms; else an explanation stands under its term
 _ROW = re.compile(r"  (?P<term>\S.*?)(?: {2,}(?P<text>\S.*))?")
 
@@ -54,7 +54,7 @@ def _wrapped(block: tuple[str, str, int], width: int) -> str:
     if not words:
         return f"  {term}"
     if column > TERMS * width or len(term) + 4 > column:
-        return f"  {term}\n{_fill(words, width, ' ' * 6, ' ' * 6)}"
+        return f"{_fill(term, width, '  ', '  ')}\n{_fill(words, width, ' ' * 6, ' ' * 6)}"
     return _fill(words, width, f"  {term}".ljust(column), " " * column)
 
 
