@@ -255,7 +255,7 @@ def _variants(task: Plannable[Any]) -> list[str]:
 def _budgets(name: str) -> str:
     rows = [
         (f"`{budget}`", f"{steps.plan:,}", f"{steps.act:,}")
-        for budget, steps in config.budgets(name).items()
+        for budget, steps in config.compose([f"task={name}"]).task.budgets.items()
     ]
     return _table(("budget", "environment steps to plan with", "to act with"), rows)
 
