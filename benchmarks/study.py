@@ -33,10 +33,10 @@ from tsbench.cli.launch import placed
 from tsbench.core.errors import Stopped, TsbenchError, os_errors
 from tsbench.core.words import duration
 from tsbench.runs import config, results
-from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.execute import complete, prepare
 from tsbench.runs.provenance import check_provenance
+from tsbench.runs.schema import RunConfig
 
 TRIALS = "trials="
 WORK = "--work"  # what a process of this file is given that trains

@@ -28,7 +28,7 @@ from tsbench.core.task import MDP, Plannable, Task
 from tsbench.core.words import duration, number
 from tsbench.leaderboard import page
 from tsbench.leaderboard.page import Row, Table, short
-from tsbench.runs import config
+from tsbench.runs import schema
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -135,7 +135,7 @@ def method_card(name: str, found: Sequence[Table]) -> str:
         _yaml("method", name),
         f"Its kinds of training stages: {stages}. They take `task.training.STAGE.KEY=VALUE`.",
     ]
-    if name in config.names("search"):
+    if name in schema.names("search"):
         parts += ["## What is tuned", "`tsbench tune` searches these:", _yaml("search", name)]
     parts += ["## Results"]
     head = ("task", "entry", *RESULT_COLUMNS)
@@ -255,7 +255,7 @@ def _variants(task: Plannable[Any]) -> list[str]:
 def _budgets(name: str) -> str:
     rows = [
         (f"`{budget}`", f"{steps.plan:,}", f"{steps.act:,}")
-        for budget, steps in config.compose([f"task={name}"]).task.budgets.items()
+        for budget, steps in schema.budgets(name).items()
     ]
     return _table(("budget", "environment steps to plan with", "to act with"), rows)
 

@@ -133,6 +133,18 @@ def test_max_episode_steps() -> None:
         gymnasium.make_vec(ROCKET, num_envs=2, max_episode_steps=0)
 
 
+def test_steps_that_nothing_allows() -> None:
+    """Also through Gymnasium's own wrappers."""
+    environment = gymnasium.make(ROCKET, distance=3.0)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        environment.step(np.zeros(2))
+    assert length(environment) == 39
+    with pytest.raises(TsbenchError, match=r"call reset\(\) first: .* the last one has ended"):
+        environment.step(np.zeros(2))
+    with pytest.raises(TsbenchError, match=r"call reset\(\) first"):
+        gymnasium.make_vec(ROCKET, num_envs=2).step(np.zeros((2, 2)))
+
+
 def test_gymnasium_does_not_cut_longer_episodes_in_silence() -> None:
     """Its time limit stands in the registration, and would end them at the standard horizon."""
     horizon = tasks.make("rocket_navigation").horizon

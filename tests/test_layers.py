@@ -47,7 +47,7 @@ ONLY_IN: dict[str, set[str]] = {
     "mink": {"planning"},
     "dm_control": {"sim", "tsbench"},
     "dm_env": {"sim", "testing"},
-    "mujoco": {"core.task", "planning", "sim", "tasks", "viewer", "bench", "cli.verbs"},
+    "mujoco": {"core.task", "planning", "sim", "tasks", "viewer", "bench"},
     "safetensors": {"core.policy", "runs.checkpoint", "evaluation.on_robot"},
     "optuna": {"runs.tune"},
     "hydra": {"runs.config", "cli.launch"},

@@ -6,6 +6,7 @@ import itertools
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -18,6 +19,7 @@ import pytest
 from tsbench import methods, tasks
 
 ROOT = Path(__file__).parents[1]
+MOST_BYTES = 4_000_000  # a wheel has 2.6 MB
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +42,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_the_data(wheel: Path) -> None:
     package = wheel / "tsbench"
+    assert (package / "py.typed").is_file()  # type checkers read the annotations
     models = list((ROOT / "models").iterdir())
     assert models
     for path in models:
         assert (package / "models" / path.name).read_bytes() == path.read_bytes()
     assert (package / "leaderboards" / "README.md").is_file()
+    assert (package / "py.typed").is_file()
     assert (package / "viewer" / "page.html").is_file()
     assert (package / "viewer" / "paper" / "page.html").is_file()
     assert {path.stem for path in (package / "references").iterdir()} <= set(tasks.names())
@@ -69,6 +73,49 @@ sys.exit(cli.main(["list"]))
     )
     assert done.returncode == 0, done.stderr
     assert all(name in done.stdout for name in tasks.names())
+
+
+def test_the_wheel_is_small(wheel: Path) -> None:
+    """The kept entries are most of it."""
+    (built,) = wheel.parent.glob("*.whl")
+    assert built.stat().st_size < MOST_BYTES
+
+
+@pytest.mark.parametrize("version", ["3.11", "3.12"])
+def test_the_wheel_starts_in_an_empty_environment(
+    version: str, wheel: Path, tmp_path: Path
+) -> None:
+    """Without any package, help and a mistake's line work. `.ci/package` installs all of them."""
+    python = shutil.which(f"python{version}")
+    if python is None or subprocess.run([python, "-c", ""]).returncode:
+        pytest.skip(f"no Python {version} here")
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+
+    def call(*words: str) -> subprocess.CompletedProcess[str]:
+        program = f"import sys; sys.path.insert(0, {str(wheel)!r}); import tsbench.cli as c; "
+        program += f"sys.exit(c.main({words!r}))"
+        return subprocess.run(
+            [python, "-S", "-c", program], cwd=tmp_path, env=environment, capture_output=True,
+            text=True,
+        )  # fmt: skip
+
+    done = call("--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("usage: tsbench COMMAND")
+    done = call("veiw")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+
+
+def test_the_sdist_makes_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
+    words = ["-m", "build", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr  # without words, build makes the wheel of the sdist
+    (source,), (built,) = tmp_path.glob("*.tar.gz"), tmp_path.glob("*.whl")
+    assert source.stat().st_size < MOST_BYTES
+    with zipfile.ZipFile(built) as archive:
+        names = {name for name in archive.namelist() if not name.endswith("/")}
+    here = {str(path.relative_to(wheel)) for path in wheel.rglob("*") if path.is_file()}
+    assert names == here
 
 
 def normalised(name: str) -> str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Literal
 
 from tsbench.core.errors import TsbenchError, quoted, unknown
@@ -29,17 +28,24 @@ if TYPE_CHECKING:
     from tsbench.sim.push import Push
     from tsbench.sim.single import Environment
 
-choose_backend()
+    __version__: str
 
-try:
-    __version__ = version("tsbench")
-except PackageNotFoundError:  # a checkout on the path that was never installed
-    __version__ = "0+unknown"
+choose_backend()
 
 __all__ = ["TsbenchError", "evaluate", "list_methods", "list_tasks", "load", "load_batched"]
 
 Variant = Literal["planning", "imitation"]
 VARIANTS: tuple[Variant, ...] = ("planning", "imitation")
+
+
+if not TYPE_CHECKING:  # a type checker would take it for a definition of every name
+
+    def __getattr__(name: str) -> str:
+        if name != "__version__":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from tsbench.core import plugins  # takes longer than `tsbench --help` may
+
+        return plugins.own().version
 
 
 def __dir__() -> list[str]:
@@ -146,6 +152,7 @@ def evaluate(
     *,
     protocol: str = "v1",
     threads: int | None = None,
+    progress: bool = True,
 ) -> Score:
     """Scores a policy by an evaluation protocol (`tsbench/evaluation/protocol.py`).
 
@@ -157,6 +164,7 @@ def evaluate(
         task: its name.
         protocol: "v1", or "smoke" for a first look that cannot be ranked.
         threads: CPU threads of the physics; None takes all cores. The score does not depend on it.
+        progress: whether a terminal shows how far the evaluation is.
 
     Raises:
         TsbenchError: a name is unknown, or the policy is for another task or does not fit.
@@ -168,6 +176,7 @@ def evaluate(
     from tsbench.evaluation import foreign, references
     from tsbench.evaluation import protocol as protocols
     from tsbench.evaluation.evaluate import evaluate as score
+    from tsbench.runs.progress import progress_bar
 
     made = tasks.make(task)
     if protocol not in protocols.PROTOCOLS:
@@ -176,7 +185,10 @@ def evaluate(
         policy = references.named(Path(policy), made) or foreign.load(Path(policy), made)
     if not isinstance(policy, (Policy, foreign.ForeignPolicy)):
         policy = foreign.made(policy, made)
-    return score(policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads)
+    with progress_bar(None, "evaluate", shown=progress) as told:
+        return score(
+            policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads, progress=told
+        )
 
 
 def _check_seed(seed: int | None) -> None:

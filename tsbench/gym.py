@@ -8,7 +8,8 @@ many = gymnasium.make_vec("tsbench/laikago_trot-v1", num_envs=512)  # stepped to
 
 The number at the end is the task's version. `make` and `make_vec` also take the arguments of
 `tsbench.load`, such as `variant="planning"`, `perturbed=True` or `seed=5`, and `make_vec` those of
-`tsbench.load_batched` and an `autoreset_mode`.
+`tsbench.load_batched` and an `autoreset_mode`. Gymnasium's wrappers of single environments go into
+`make_vec(..., wrappers=...)` with `vectorization_mode="sync"` or `"async"`.
 
 A task ends its episodes itself, at its horizon. `max_episode_steps` can only end them earlier.
 """

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from tsbench.cli.launch import directory
+from tsbench.runs import config
+
 WORDS = [
     "task=rocket_navigation",
     "budget=smoke",
@@ -66,10 +69,8 @@ def test_jobs_in_other_processes(launcher: str, words: Sequence[str], tmp_path: 
     plugins = tmp_path / "plugins"
     (plugins / "hydra_plugins").mkdir(parents=True)
     (plugins / "hydra_plugins" / "elsewhere.py").write_text(PLUGIN)
-    places = [
-        f"runs/rocket_navigation/monolithic/seed{seed}-smoke,{','.join(WORDS[4:6])}"
-        for seed in (0, 1)
-    ]
+    jobs = [[*WORDS[:-1], f"seed={seed}"] for seed in (0, 1)]
+    places = [str(directory(config.compose(job), job)) for job in jobs]
     (tmp_path / places[0]).mkdir(parents=True)
     (tmp_path / places[0] / "notes.txt").touch()
 

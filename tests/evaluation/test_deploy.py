@@ -146,6 +146,8 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     for words, line in (
         ([str(run), str(out)], "exists"),
         ([str(run), f"{out}2", "--method", "mine"], "--method is for a policy of another library"),
+        ([str(run), f"{out}2", "--activation", "elu"], "--activation is for a .pt file"),
+        ([str(run), f"{out}2", "--vecnormalize", "v"], "--vecnormalize is for a stable-baselines3"),
         ([str(run), "task=laikago_trot", f"{out}2"], "for rocket_navigation, not for laikago_trot"),
         ([str(tmp_path / "p.onnx"), f"{out}2"], "task=NAME is missing"),
         ([str(tmp_path / "p.onnx"), f"task={TASK.name}", f"{out}2"], "--method NAME is missing"),

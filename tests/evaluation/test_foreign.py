@@ -487,6 +487,8 @@ def test_the_command_line(
         ([path, "rocket_navigation"], "expected task=NAME, not 'rocket_navigation'"),
         (["zero"], "task=NAME is missing"),
         ([str(baseline[0]), "task=rocket_navigation"], "if you trust it: --trust-sb3 A2C|"),
+        (["zero", "task=rocket_navigation", "--vecnormalize", "v"], "--vecnormalize is for a st"),
+        (["model.pt", "task=rocket_navigation"], "no policy model.pt"),
         (["nothing.onnx", "task=rocket_navigation"], "no policy nothing.onnx"),
         (["zero", "task=rocket_navigation", "--protocol", "v0"], "unknown protocol 'v0'"),
         (["zero", "task=rocket_navigation", "--threads", "0"], "--threads: must be a whole number"),

@@ -9,7 +9,7 @@ import pytest
 from tsbench import methods, tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.typed import typed
-from tsbench.runs import config
+from tsbench.runs import config, schema
 
 TASK = "task=rocket_navigation"
 
@@ -39,8 +39,8 @@ def test_the_paper_budget_is_the_papers(name: str, plan: int, act: int) -> None:
 
 
 def test_no_central_list_of_tasks_and_methods() -> None:
-    assert config.names("task") == tasks.names()
-    assert config.names("method") == methods.names()
+    assert schema.names("task") == tasks.names()
+    assert schema.names("method") == methods.names()
 
 
 def test_words_change_values_and_open_mappings_need_no_plus() -> None:

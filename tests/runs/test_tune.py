@@ -21,8 +21,8 @@ from tsbench.cli import verbs
 from tsbench.core import plugins
 from tsbench.core.errors import NotFiniteError, PlanError
 from tsbench.runs import config, execute, tune
-from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import RunConfig
 from tsbench.runs.tune import Dimension, Study
 
 KEY = "task.training.task.entropy"

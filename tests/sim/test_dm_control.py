@@ -8,6 +8,7 @@ import unittest
 from collections.abc import Callable
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from dm_control.mujoco.wrapper import enable_timer
@@ -256,6 +257,26 @@ def test_a_state_before_the_first_reset() -> None:
     assert trace(made, given) == trace(reached, given)
 
 
+def test_mujocos_own_signatures() -> None:
+    """They set that part of mujoco's state; the task's clock and memory stay."""
+    env, other = (tsbench.load("laikago_walk") for _ in range(2))
+    given = actions(env, 6)
+    for one in (env, other):
+        one.reset()
+        trace(one, given[:3])
+    clock, position = env.task.state.time.copy(), env.physics.data.qpos.copy()
+    part = int(mujoco.mjtState.mjSTATE_QVEL)
+    still = np.zeros_like(env.physics.get_state(part))
+    env.physics.set_state(still, part)
+    other.physics.data.qvel[:] = 0.0
+    other.physics.forward()
+    np.testing.assert_array_equal(values_now(env), values_now(other))
+    np.testing.assert_array_equal(env.task.state.time, clock)
+    np.testing.assert_array_equal(env.physics.data.qpos, position)
+    assert not env.task.state.joint_velocity.any()
+    assert trace(env, given[3:]) == trace(other, given[3:])
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -327,6 +348,7 @@ def test_a_copied_environment_goes_on_alike(
     trace(env, given[:5])
     twin = copied(env)
     assert trace(twin, given[5:]) == trace(env, given[5:])
+    assert twin.control_timestep() == env.control_timestep() == twin.task.mdp.timestep
     twin.physics.set_state(env.physics.get_state())
     assert twin.task.random.normal() == env.task.random.normal()
     physics = env.physics.copy()  # mere physics

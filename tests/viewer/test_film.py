@@ -85,7 +85,7 @@ def pictures_of(more: str = "") -> tuple[NDArray[np.float64], NDArray[np.float64
     model = mujoco.MjModel.from_xml_string(BALL.format(more=more))
     executed, ghost = np.zeros((2, 7)), np.zeros((2, 7))
     executed[:, 2:4], ghost[:, 2:4] = (0.4, 1.0), (0.4, 1.0)
-    executed[1, 0] = ghost[1, 0] = 0.1
+    executed[1, 0] = 0.1
     ghost[:, 1] = -0.9  # towards the camera
     actors = [
         Actor("executed", executed, 0.1, EXECUTED_COLOUR, ""),
@@ -125,15 +125,10 @@ def test_the_end_of_a_film_is_drawn_once(monkeypatch: pytest.MonkeyPatch, tmp_pa
     model = mujoco.MjModel.from_xml_string(BALL.format(more=""))
     qpos = np.zeros((11, 7))
     qpos[:, 2:4] = 0.4, 1.0
-    actors = [Actor("executed", qpos, 0.05, EXECUTED_COLOUR, "", ending="solved after 0.50 s")]
-    drawn, shares = list[float](), list[float]()
+    actors = [Actor("executed", qpos, 0.05, EXECUTED_COLOUR, "", ending="solved at 0.50 s")]
+    drawn, shares = [], list[float]()
     frame = film.Camera.frame
-
-    def noted(self: film.Camera, t: float) -> film.Picture:
-        drawn.append(t)
-        return frame(self, t)
-
-    monkeypatch.setattr(film.Camera, "frame", noted)
+    monkeypatch.setattr(film.Camera, "frame", lambda self, t: drawn.append(t) or frame(self, t))
     film.write_video(Show(model, actors, ""), tmp_path / "film.mp4", shares.append)
     assert drawn == pytest.approx([*np.arange(15) / 30, 0.5])
     assert shares == pytest.approx(np.arange(1, 16) / 15)

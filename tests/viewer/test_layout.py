@@ -134,9 +134,10 @@ def check_view(browser: Browser, url: str, name: str) -> None:
                 assert inside(box, regions["stage"]), box
             assert not overlapping(found["over_picture"]), screen
             stage = regions["stage"]
-            assert stage[4] - stage[2] >= 240
+            assert stage[4] - stage[2] >= (240 if screen == PHONE else 160)
+            if screen != PHONE:
+                assert found["below"] <= 0, screen
             if screen == WINDOW:
-                assert found["below"] <= 0
                 assert max(found["cut"]) <= 0, name
         for place in places:
             assert inside(place, stage), place
@@ -221,15 +222,14 @@ def test_text_can_be_read_in_both_schemes(
 def test_the_leaderboard_fits_the_screen(
     browser: Browser, tmp_path: Path, screen: tuple[int, int]
 ) -> None:
-    """With the kept entries, and tables that scroll within their frames if at all."""
+    """With the kept entries. On a phone on its side tables may scroll within their frames."""
     write_site(BOARD, tmp_path, None, lambda line: None)
     for path in [tmp_path / "index.html", *sorted(tmp_path.rglob("*/*/index.html"))[:3]]:
         with browser.open(path.as_uri(), screen):
             assert browser.ask("document.documentElement.scrollWidth - innerWidth") <= 0, path
-            if screen == PHONE and path.parent == tmp_path:
-                cut = """[...document.querySelectorAll(".wide")]
-                  .map((one) => one.scrollWidth - one.clientWidth)"""
-                assert max(browser.ask(cut)) <= 0
+            cut = """[...document.querySelectorAll(".wide")]
+              .map((one) => one.scrollWidth - one.clientWidth)"""
+            assert screen == ON_ITS_SIDE or max(browser.ask(cut)) <= 0
             browser.screenshot(f"site_{path.parent.name}_{screen[0]}")
 
 

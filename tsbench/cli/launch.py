@@ -25,19 +25,20 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
-from tsbench.cli import tables
+from tsbench.cli import hints, tables
 from tsbench.core.errors import Stopped, TsbenchError, memory_errors
 from tsbench.core.files import write_json
+from tsbench.core.words import command
 from tsbench.rl import processes
 from tsbench.runs import config, execute
-from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory, shown
+from tsbench.runs.schema import ELSEWHERE, RunConfig
 from tsbench.viewer.report import write_pages
 
 RUNS = Path("runs")
-LONGEST_NAME = 200  # characters; file systems allow 255 bytes
+LONGEST_NAME = 48  # characters of a run directory's name, without its hash
 CHECKED_JOBS = 1000  # jobs of a sweep checked before it starts; later ones when they start
-PART_OF_THE_NAME = ("task", "method", "seed", "budget", *config.ELSEWHERE)
+PART_OF_THE_NAME = ("task", "method", "seed", "budget", *ELSEWHERE)
 RESUME = "resume="
 
 
@@ -52,8 +53,13 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
         TsbenchError: the words are wrong, or a run failed. A sweep continues after a failed run.
         Stopped: Ctrl-C or SIGTERM stopped the run.
     """
-    parser = _parser()
-    flags = parser.parse_intermixed_args(list(words))
+    parser, words = _parser(), hints.expanded(words)
+    flags, others = parser.parse_known_intermixed_args(words)
+    if others:
+        hint = hints.of_flag(others[0], words)
+        parser.error(f"unrecognized arguments: {' '.join(others)}{hint}")
+    if not (flags.shell_completion or flags.hydra_help or flags.info):
+        hints.check(flags.overrides)
     if any(word.startswith(RESUME) for word in words):
         if len(words) > 1:
             raise TsbenchError("resume=RUN goes on with the run's own configuration: give it alone")
@@ -89,7 +95,7 @@ def finish(directory: Path, console: Console | None = None) -> None:
     finished, console = RunDirectory(directory), console or Console()
     record = finished.record()
     tables.show_run(console, record, finished.task(record.task))
-    way_on = f"; the run is finished, its pages are not: tsbench report {directory}"
+    way_on = f"; the run is finished, its pages are not: {command('report', directory)}"
     try:
         with execute.signals(_stop), memory_errors():
             write_pages(finished)
@@ -110,14 +116,18 @@ def placed(chosen: RunConfig, words: Sequence[str]) -> RunConfig:
 
 
 def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
-    """The standard run directory. Words that change other keys are appended to its name."""
+    """The standard run directory. Words that change other keys are part of its name: the ends of
+    their keys and their values, as far as there is room, and a hash of them all."""
     name = f"seed{chosen.seed}-{chosen.budget}"
-    for word in _own(words):
-        key = word.lstrip("+~").split("=")[0]
-        if key not in PART_OF_THE_NAME:
-            name += "," + re.sub(r"[^\w.=-]+", "_", word.lstrip("+~"))
-    if len(name) > LONGEST_NAME:
-        name = name[:LONGEST_NAME] + "-" + hashlib.sha256(name.encode()).hexdigest()[:8]
+    others = [word.lstrip("+") for word in _own(words)]
+    others = sorted(one for one in others if one.split("=")[0].strip("~") not in PART_OF_THE_NAME)
+    for word in others:
+        key, separator, value = word.partition("=")
+        short = f",{key.rpartition('.')[2]}{separator}{value}"
+        name += re.sub(r"[^\w.=,-]+", "_", short)
+    if others:
+        mark = hashlib.sha256("\n".join(others).encode()).hexdigest()[:8]
+        name = f"{name[:LONGEST_NAME].rstrip(',=')}-{mark}"
     return RUNS / chosen.task.name / str(chosen.method["name"]) / name
 
 

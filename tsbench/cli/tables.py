@@ -2,78 +2,104 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tsbench import tasks
+from tsbench.cli.rows import Section, show_rows, show_sections
 from tsbench.core.task import Task
-from tsbench.core.words import duration, number
+from tsbench.core.words import command, duration, number, short
 from tsbench.evaluation.flips import Flips
 from tsbench.evaluation.score import Score
-from tsbench.evaluation.words import FIGURES, counts, episode_rows, push_rows, verdict
+from tsbench.evaluation.statistics import RANKED_SEEDS
+from tsbench.evaluation.words import (
+    FIGURES,
+    counts,
+    episode_rows,
+    push_rows,
+    reference_rows,
+    verdict,
+)
+from tsbench.leaderboard import kept
+from tsbench.leaderboard.submission import read_manifest
 from tsbench.runs.directory import Record, RunDirectory
-from tsbench.viewer.paper import scores
+
+if TYPE_CHECKING:
+    from tsbench.runs.results import Results
+    from tsbench.viewer.comparison import Pair
+    from tsbench.viewer.paper import scores
 
 HEADLINES = ("solved_reward", "normalized_reward", "against_plan")
 
 
-def score_table(title: str, score: Score, task: Task[Any]) -> Table:
-    """The table of a score: perturbed starts, the task's own start, changed physics and pushes."""
+def show_score(console: Console, title: str, score: Score, task: Task[Any], *more: Section) -> None:
+    """Prints a score: perturbed starts, the task's own start, changed physics and pushes; then
+    references to compare it with, and what the figures mean.
+
+    Args:
+        console: the terminal.
+        title: above the table.
+        score: of a policy.
+        task: that the score is of.
+        more: further sections.
+    """
     perturbed = score.perturbed
-    table = Table(
-        title=escape(title),
-        title_justify="left",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        caption="\n".join(f"{name}: {FIGURES[name]}" for name in HEADLINES),
-        caption_justify="left",
-    )
-    table.add_column(f"protocol {score.protocol}")
-    table.add_column(f"{perturbed.episodes} perturbed starts", justify="right")
-    table.add_column("own start", justify="right")
-    table.add_row(verdict(perturbed), style="bold")
-    for label, value, own in episode_rows(score, task):
-        table.add_row(label, value, own)
-    table.add_section()
-    table.add_row("changed physics", "solved", "normalized_reward", style="bold")
-    for name, change in score.changes.items():
-        solved = f"{counts(change)[0]} of {change.episodes}"
-        table.add_row(name, solved, number(change.normalized_reward))
-    table.add_section()
-    table.add_row("pushes", "survived", "task solved", style="bold")
-    for label, survived, recovered in push_rows(score):
-        table.add_row(label, survived, recovered)
-    return table
+    headers = (f"protocol {score.protocol}", f"{perturbed.episodes} perturbed starts", "own start")
+    changes = [
+        (name, f"{counts(change)[0]} of {change.episodes}", number(change.normalized_reward))
+        for name, change in score.changes.items()
+    ]
+    sections = [
+        Section(headers, list(episode_rows(score, task)), verdict(perturbed)),
+        Section(("changed physics", "solved", "normalized_reward"), changes),
+        Section(("pushes", "survived", "task solved"), list(push_rows(score))),
+    ]
+    if beside := [*reference_rows(score), *(kept_rows(task) if tasks.standard(task) else ())]:
+        headers = ("for comparison, by protocol v1", "solved_reward", "success")
+        sections.append(Section(headers, beside))
+    show_sections(console, [*sections, *more], title=title)
+    for name in HEADLINES:
+        console.print(f"{name}: {FIGURES[name]}", style="italic", highlight=False)
 
 
-def flips_table(physics: str, found: Sequence[Flips]) -> Table:
-    """The numbers of verdicts that change in other physics."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column(f"verdicts that change in physics {physics}")
-    table.add_column("flipped", justify="right")
-    table.add_column("share", justify="right")
-    for one in found:
-        table.add_row(one.verdict, f"{one.flipped} of {one.verdicts}", f"{one.share:.1%}")
-    return table
+def kept_rows(task: Task[Any]) -> Iterator[tuple[str, str, str]]:
+    """Rows of a kept entry's name, its `solved_reward` and its `success`, means over its trainings,
+    of the entries for a task."""
+    for name, entry in kept.entries().items():
+        if not name.startswith(f"{task.name}/"):
+            continue
+        manifest = read_manifest(entry)
+        if manifest.task_version == task.version:
+            claims = [training.claimed for training in manifest.trainings]
+            label = f"kept {name}" + (f" ({len(claims)} seeds)" if len(claims) > 1 else "")
+            reward = sum(one.solved_reward for one in claims) / len(claims)
+            success = sum(one.success for one in claims) / len(claims)
+            yield label, number(reward), number(success)
+
+
+def show_flips(console: Console, physics: str, found: Sequence[Flips]) -> None:
+    """Prints the numbers of verdicts that change in other physics."""
+    rows = [(one.verdict, f"{one.flipped} of {one.verdicts}", f"{one.share:.1%}") for one in found]
+    show_rows(console, (f"verdicts that change in physics {physics}", "flipped", "share"), rows)
 
 
 def show_run(console: Console, record: Record, task: Task[Any]) -> None:
     """Prints the score of a finished run and the cost of each stage."""
-    table = score_table(record.title, record.score, task)
-    table.add_section()
-    table.add_row("stage", "steps", "time", style="bold")
-    for stage in record.stages:
-        table.add_row(stage.name, f"{stage.steps:,}", duration(stage.seconds))
-    console.print(table)
+    stages = [(one.name, f"{one.steps:,}", duration(one.seconds)) for one in record.stages]
+    cost = Section(("stage", "steps", "time"), stages)
+    show_score(console, record.title, record.score, task, cost)
     show_rank(console, record.standard, record.score)
 
 
 def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
     """Prints the scores of many runs: a table for each task, a column for each method."""
+    from tsbench.viewer.paper import scores  # draws, and so loads slowly
+
     for task in dict.fromkeys(line.group.task for line in lines):
         own = [line for line in lines if line.group.task == task]
         table = Table(title=task, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
@@ -87,11 +113,56 @@ def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
         console.print(table)
 
 
+def show_runs(console: Console, runs: Mapping[str, Results]) -> None:
+    """Prints a row for each run: its figures and what it used.
+
+    Args:
+        console: the terminal.
+        runs: what was found under each word of the command line.
+    """
+    rows: dict[str, list[Sequence[str]]] = {}
+    for word, found in runs.items():
+        for row in found.rows.values():
+            label = word if len(found.rows) == 1 else f"{word} seed {row.seed}"
+            seconds = sum(stage.seconds for stage in row.stages)
+            solved, survived = "no policy", "-"
+            if row.score is not None:
+                summary = row.score.perturbed
+                solved = f"{counts(summary)[0]} of {summary.episodes}"
+                survived = f"{row.score.robustness.survival_100N:.1%}"
+            reward = number(row.solved_reward)
+            used = (short(row.steps), duration(seconds))
+            rows.setdefault(row.task, []).append((label, solved, reward, survived, *used))
+    headers = ("run", "solved", "solved_reward", "100 N", "steps", "time")
+    for task, members in rows.items():
+        show_rows(console, headers, members, title=task)
+
+
+def show_pairs(console: Console, pairs: Sequence[Pair]) -> None:
+    """Prints the differences of `solved_reward` between groups of runs, and how sure they are."""
+    rows: dict[str, list[Sequence[str]]] = {}
+    for pair in pairs:
+        mean = interval = "-"
+        if (found := pair.difference) is not None:
+            mean = f"{found.mean:+.4f}"
+            if found.interval is not None:
+                interval = f"{found.interval[0]:+.4f} to {found.interval[1]:+.4f}"
+        p_value = "-" if pair.p_value is None else f"{pair.p_value:.3g}"
+        cells = (f"{pair.first} less {pair.second}", str(pair.seeds), mean, interval, p_value)
+        rows.setdefault(pair.task, []).append(cells)
+    headers = ("solved_reward of", "seeds", "mean", "95 % interval", "p (Holm)")
+    for task, members in rows.items():
+        show_rows(console, headers, members, title=f"{task}, seed by seed")
+    if any(pair.difference is None or pair.difference.interval is None for pair in pairs):
+        line = f"Over the seeds that both have; an interval needs {RANKED_SEEDS} of them."
+        console.print(line, highlight=False)
+
+
 def show_places(console: Console, run: RunDirectory) -> None:
     """Prints the report's path and the command that makes the score again."""
     for label, place in (
         ("report", run.report_file),
-        ("score again", f"tsbench evaluate {run.path}"),
+        ("score again", command("evaluate", run.path)),
     ):
         console.print(f" {label:<12} {place}", markup=False, highlight=False, soft_wrap=True)
 

@@ -8,17 +8,18 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from importlib.metadata import version
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
+from tsbench.cli import places
+from tsbench.cli.streams import loading, open_closed, warnings_as_usual
+from tsbench.cli.usage import fitted
+from tsbench.core.errors import Stopped, TsbenchError, nearest, unknown
+from tsbench.gl import draw_nothing, find_working_backend
 
-from tsbench.core.errors import Stopped, TsbenchError, unknown
-from tsbench.gl import find_working_backend
+if TYPE_CHECKING:
+    from rich.console import Console
 
 RUN_HELP = """\
 usage: tsbench run task=NAME [method=NAME] [budget=NAME] [seed=N] [key=value ...] [options]
@@ -83,6 +84,17 @@ PICTURES = ("--video", "--strip")  # options that need OpenGL
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are TsbenchErrors of one line."""
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """The options. An unknown one is refused with the nearest that there is."""
+        options, others = self.parse_known_args(args, namespace)
+        if not others:
+            return options
+        flags = [flag for flag in self._option_string_actions if flag.startswith("--")]
+        key = others[0].lstrip("-").partition("=")[0]
+        near = nearest(f"--{key}", flags)
+        hint = f" (did you mean {near}?)" if near else ""
+        return self.error(f"unrecognized arguments: {' '.join(others)}{hint}")
+
     def error(self, message: str) -> NoReturn:
         raise TsbenchError(f"{message} (see {self.prog} --help)")
 
@@ -108,8 +120,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    open_closed()
     try:
-        status = _dispatch(words)
+        with warnings_as_usual():
+            status = _dispatch(words)
         sys.stdout.flush()
     except TsbenchError as error:
         return _fail(str(error), 2)
@@ -138,36 +152,38 @@ def _drop_output() -> None:
 
 def _dispatch(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
-        sys.stdout.write(_help())
+        sys.stdout.write(fitted(_help()))
     elif words[0] == "--version":
-        sys.stdout.write(f"tsbench {version('tsbench')}\n")
+        from tsbench.core import plugins
+
+        sys.stdout.write(f"tsbench {plugins.own().version}\n")
     elif words[0] in ("-sc", "--shell-completion"):
         _complete(words)
     elif words[0] in VERBS:
-        if words[0] == "view" and any(w.startswith(PICTURES) for w in words):
-            find_working_backend()
-        if words[0] == "figures":
-            with suppress(TsbenchError):  # only the motion strips are then left out
-                find_working_backend()
-        _check_graphics()
+        _choose_graphics(words)
         return VERBS[words[0]].call(words[1:]) or 0
+    elif "=" in words[0]:
+        hint = f"(did you mean 'tsbench run {words[0]}'?)"
+        raise TsbenchError(f"a command comes first, not {words[0]!r} {hint}")
     else:
         raise unknown("command", words[0], VERBS)
     return 0
 
 
-def _check_graphics() -> None:
-    """Imports mujoco, which loads the OpenGL library that MUJOCO_GL names.
+def _choose_graphics(words: list[str]) -> None:
+    """Chooses the OpenGL library before mujoco is imported: one that works for a verb that draws
+    pictures, and none for the others.
 
     Raises:
-        TsbenchError: mujoco cannot be imported with this MUJOCO_GL.
+        TsbenchError: none works, and the verb cannot do without.
     """
-    try:
-        import mujoco  # noqa: F401
-    except Exception as error:
-        setting = os.environ.get("MUJOCO_GL", "")
-        reason = str(error).partition("\n")[0]
-        raise TsbenchError(f"mujoco does not start with MUJOCO_GL={setting}: {reason}") from error
+    if words[0] == "view" and any(word.startswith(PICTURES) for word in words):
+        find_working_backend()
+    elif words[0] == "figures":
+        with suppress(TsbenchError):  # only the motion strips are then left out
+            find_working_backend()
+    else:
+        draw_nothing()
 
 
 def _help() -> str:
@@ -188,9 +204,10 @@ first steps:
 
 def _run(words: Sequence[str]) -> None:
     if "-h" in words or "--help" in words:
-        sys.stdout.write(RUN_HELP)
+        sys.stdout.write(fitted(RUN_HELP))
         return
-    from tsbench.cli import launch
+    with loading():
+        from tsbench.cli import launch
 
     parser = Parser("tsbench run", add_help=False, allow_abbrev=False)
     parser.add_argument("--json", type=_new_file)
@@ -215,17 +232,22 @@ def _complete(words: Sequence[str]) -> None:
 
 def _list(words: Sequence[str]) -> None:
     parser = _parser("list")
+    what = "show this task's card, as `tsbench describe` does"
+    parser.add_argument("task", nargs="?", metavar="TASK", help=what)
     options = parser.parse_args(words)
+    if options.task is not None:
+        _show_card(options)
+        return
     from tsbench import methods, tasks
     from tsbench.core import plugins
     from tsbench.core.files import write_json
-    from tsbench.runs import config
+    from tsbench.runs import schema
     from tsbench.sim.promises import check_promises
 
     made, budgets, faults = {}, {}, []
     for name in tasks.names():
         try:
-            made[name], budgets[name] = tasks.make(name), config.budgets(name)
+            made[name], budgets[name] = tasks.make(name), schema.budgets(name)
             if tasks.provider(name) != plugins.own():  # the contract tests check tsbench's own
                 check_promises(name, made[name])
         except TsbenchError as error:
@@ -246,37 +268,60 @@ def _list(words: Sequence[str]) -> None:
             if (provider := kind.provider(name)) not in (None, plugins.own()):
                 brought.setdefault(str(provider), []).append(name)
     refused = tuple(dict.fromkeys((*tasks.refused(), *methods.refused())))
-    incomplete = (*config.incomplete(), *faults)
+    incomplete = (*schema.incomplete(), *faults)
     offered = tuple(dict.fromkeys(name for amounts in budgets.values() for name in amounts))
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for header in ("task", "version", "seconds", *offered):
-        table.add_column(header, no_wrap=True)
+    from rich.console import Console
+
+    from tsbench.cli.rows import show_rows
+    from tsbench.core.words import short
+
+    console = Console()
+    lines = []
     for name, row in rows.items():
         amounts = [budgets[name].get(budget) for budget in offered]
-        costs = [f"{_short(a.plan)} + {_short(a.act)}" if a else "-" for a in amounts]
-        table.add_row(name, str(row["version"]), f"{row['seconds']:g}", *costs)
-    console = Console()
-    console.print(table)
+        costs = [f"{short(a.plan)} + {short(a.act)}" if a else "-" for a in amounts]
+        lines.append((name, str(row["version"]), f"{row['seconds']:g}", *costs))
+    show_rows(console, ("task", "version", "seconds", *offered), lines, folded=None)
     console.print("Budgets: environment steps to plan with + to act with.")
-    table = Table("method", "what it does", box=SIMPLE_HEAD, pad_edge=False)
-    for name, summary in summaries.items():
-        table.add_row(name, summary)
-    console.print(table)
-    lines = [f"Plug-in {provider}: {', '.join(names)}" for provider, names in brought.items()]
-    lines += [f"Refused: {line}" for line in refused]
-    lines += [f"Incomplete: {line}" for line in incomplete]
-    for line in lines:
+    show_rows(console, ("method", "what it does"), list(summaries.items()), folded=1)
+    remarks = [f"Plug-in {provider}: {', '.join(names)}" for provider, names in brought.items()]
+    remarks += [f"Refused: {line}" for line in refused]
+    remarks += [f"Incomplete: {line}" for line in incomplete]
+    for line in remarks:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     shown = {"tasks": rows, "methods": summaries, "plug-ins": brought, "refused": refused}
     write_json(options.json, {**shown, "incomplete": incomplete})
 
 
-def _short(steps: int) -> str:
-    """A number of steps to three digits, with k for thousands and M for millions."""
-    for size, letter in ((1_000_000, "M"), (1_000, "k")):
-        if steps >= size:
-            return f"{steps / size:.3g}{letter}"
-    return str(steps)
+def _describe(words: Sequence[str]) -> None:
+    parser = _parser("describe")
+    parser.add_argument("task", metavar="TASK", help="its name, which `tsbench list` gives")
+    _show_card(parser.parse_args(words))
+
+
+def _show_card(options: Any) -> None:
+    from rich.console import Console
+
+    from tsbench.cli import describe
+    from tsbench.core.files import write_json
+
+    write_json(options.json, describe.show(Console(), options.task.removeprefix("task=")))
+
+
+def _doctor(words: Sequence[str]) -> None:
+    parser = _parser("doctor")
+    options = parser.parse_args(words)
+    from rich.console import Console
+
+    from tsbench.cli import doctor
+    from tsbench.core.files import write_json
+
+    console, found = Console(), list[tuple[str, str]]()
+    for subject, state in doctor.findings():
+        found.append((subject, state))
+        line = f"{subject:<18} {state}"
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    write_json(options.json, dict(found))
 
 
 def _parser(verb: str, *, json: bool = True) -> Parser:
@@ -295,7 +340,7 @@ def _new_file(word: str) -> Path:
     """
     from tsbench.core.files import check_new
 
-    path = Path(word)
+    path = places.path(word)
     check_new(path)
     return path
 
@@ -305,7 +350,8 @@ def _evaluate(words: Sequence[str]) -> int:
     parser.add_argument(
         "policy",
         metavar="POLICY_OR_RUN",
-        help="directory with a policy in it, .onnx file, stable-baselines3 .zip, zero or random",
+        help="directory with a policy in it, kept entry (TASK/ENTRY), .onnx file, "
+        "stable-baselines3 .zip, zero or random",
     )
     parser.add_argument(
         "task", nargs="?", metavar="task=NAME", help="for a policy that names no task"
@@ -325,8 +371,10 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="ALGORITHM",
         help="the algorithm that saved the .zip, which can run any code when it is loaded",
     )
-    parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=VECNORMALIZE)
+    parser.add_argument("--vecnormalize", type=places.path, metavar="FILE", help=VECNORMALIZE)
     options = parser.parse_args(words)
+    from rich.console import Console
+
     from tsbench import tasks
     from tsbench.cli import tables
     from tsbench.core.files import write_json
@@ -338,7 +386,7 @@ def _evaluate(words: Sequence[str]) -> int:
     from tsbench.runs import directory
     from tsbench.runs.progress import progress_bar
 
-    path = Path(options.policy)
+    path = places.run(options.policy)
     policy, task = _policy(path, options.task, options.trust_sb3, options.vecnormalize)
     run = directory.RunDirectory(path)
     kept = run.record() if run.finished else None
@@ -355,7 +403,7 @@ def _evaluate(words: Sequence[str]) -> int:
         score = evaluate(
             policy, task, protocol=protocol, threads=options.threads, progress=progress
         )
-    console.print(tables.score_table(f"{task.name}: {options.policy}", score, task))
+    tables.show_score(console, f"{task.name}: {options.policy}", score, task)
     tables.show_rank(console, standard, score)
     shown: dict[str, Any] = {**score.as_dict(), "standard": standard}
     confirmed = True
@@ -378,7 +426,7 @@ def _evaluate(words: Sequence[str]) -> int:
                 engine=engine,
             )
         flipped = flips(score, other)
-        console.print(tables.flips_table(options.physics, flipped))
+        tables.show_flips(console, options.physics, flipped)
         console.print(
             f" solved_reward: {number(score.solved_reward)} by protocol {protocol.name}, "
             f"{number(other.solved_reward)} in physics {options.physics}, which is never ranked",
@@ -424,8 +472,9 @@ def _policy(
     from tsbench.runs.directory import RunDirectory
 
     name = None if word is None else _task_name(word)
-    if trust_sb3 is not None and path.suffix != ".zip":
-        raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
+    for flag, given in (("--trust-sb3", trust_sb3), ("--vecnormalize", vecnormalize)):
+        if given is not None and path.suffix != ".zip":
+            raise TsbenchError(f"{flag} is for a stable-baselines3 .zip, not for {path}")
     if path.is_dir():
         run = RunDirectory(path)
         policy = run.policy()
@@ -471,7 +520,7 @@ def _whole_number(word: str, lowest: int, highest: int) -> int:
 
 def _view(words: Sequence[str]) -> None:
     parser = _parser("view", json=False)
-    what = "a run's directory, a plan's file (plan.npz), or task=NAME"
+    what = "a run's directory, a kept entry (TASK/ENTRY), a plan's file (plan.npz), or task=NAME"
     parser.add_argument("what", nargs="?", metavar="RUN|PLAN|task=NAME", help=what)
     parser.add_argument("--compare", nargs=2, metavar="RUN", help="two runs of one task instead")
     push = "push the robot for 0.1 s, e.g. 100N@0.5s:+y: newtons, when, where to (axis or degrees)"
@@ -494,8 +543,13 @@ def _view(words: Sequence[str]) -> None:
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
 
+    compared = [str(places.run(word)) for word in options.compare or ()]
+    chosen = options.what or ""
+    if chosen and not chosen.startswith("task="):
+        chosen = str(places.run(chosen))
+
     def show(push: str | None) -> Show:
-        return pair(options.compare, push) if options.compare else subject(options.what).show(push)
+        return pair(compared, push) if compared else subject(chosen).show(push)
 
     shown = show(options.push)
     if options.html:
@@ -524,15 +578,15 @@ def _port(word: str) -> int:
 
 def _report(words: Sequence[str]) -> None:
     parser = _parser("report", json=False)
-    parser.add_argument("run", type=Path, metavar="RUN", help="a finished run's directory")
+    parser.add_argument("run", metavar="RUN", help="a finished run's directory, or TASK/ENTRY")
     what = "the new page (the missing ones of report.html and view.html in RUN)"
-    parser.add_argument("--html", type=Path, metavar="FILE", help=what)
+    parser.add_argument("--html", type=places.path, metavar="FILE", help=what)
     options = parser.parse_args(words)
     from tsbench.core.files import check_new, write_new
     from tsbench.runs.directory import RunDirectory
     from tsbench.viewer import report
 
-    run = RunDirectory(options.run)
+    run = RunDirectory(places.run(options.run))
     report.check_finished(run)
     path = options.html or run.report_file
     check_new(path, "give another by --html FILE")
@@ -545,7 +599,7 @@ def _report(words: Sequence[str]) -> None:
 
 def _tune(words: Sequence[str]) -> None:
     if "-h" in words or "--help" in words:
-        sys.stdout.write(TUNE_HELP)
+        sys.stdout.write(fitted(TUNE_HELP))
         return
     try:
         from tsbench.runs import tune
@@ -554,6 +608,7 @@ def _tune(words: Sequence[str]) -> None:
             raise
         raise TsbenchError("optuna is missing: pip install 'tsbench[tune]'") from None
     from tsbench.core.files import write_json
+    from tsbench.core.words import command
 
     parser = Parser("tsbench tune", add_help=False, allow_abbrev=False)
     parser.add_argument("--best", action="store_true")
@@ -563,7 +618,7 @@ def _tune(words: Sequence[str]) -> None:
     for key in own:
         own[key] = next((w.partition("=")[2] for w in others if w.startswith(f"{key}=")), "")
     common = [word for word in others if not word.startswith(tuple(f"{key}=" for key in own))]
-    study = tune.prepare(common, Path(own["study"]) if own["study"] else None)
+    study = tune.prepare(common, places.path(own["study"]) if own["study"] else None)
     if not options.best:
         if not own["trials"]:
             raise TsbenchError("trials=N is missing, the number of trials of the whole study")
@@ -574,7 +629,7 @@ def _tune(words: Sequence[str]) -> None:
         tune.tune(study, trials, told=lambda line: sys.stderr.write(f"{line}\n"))
     trial, spent = tune.best(study)
     chosen = study.chosen(trial.params)
-    sys.stdout.write(f"tsbench run {' '.join(chosen)}\n")
+    sys.stdout.write(f"{command('run', *chosen)}\n")
     figures = {"words": chosen, "value": trial.value, "trial": trial.number, "trials": spent}
     write_json(options.json, {**figures, "seeds": study.seeds})
 
@@ -582,9 +637,9 @@ def _tune(words: Sequence[str]) -> None:
 def _collect(words: Sequence[str]) -> None:
     parser = _parser("collect", json=False)
     what = "runs, entries, results folders, or folders with such in them"
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS", help=what)
+    parser.add_argument("runs", nargs="+", type=places.path, metavar="RUNS", help=what)
     out = "the results folder, which is made where there is none"
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=out)
+    parser.add_argument("--out", type=places.path, required=True, metavar="DIR", help=out)
     trials = "trials that were spent on tuning the settings of these runs"
     parser.add_argument("--trials", type=_trials, metavar="N", help=trials)
     options = parser.parse_args(words)
@@ -599,13 +654,48 @@ def _trials(word: str) -> int:
     return _whole_number(word, 0, 10**6)
 
 
+def _compare(words: Sequence[str]) -> None:
+    parser = _parser("compare")
+    what = "runs, kept entries (TASK/ENTRY), results folders, or folders with such in them"
+    parser.add_argument("runs", nargs="+", metavar="RUN", help=what)
+    parser.add_argument(
+        "--png", type=_new_file, metavar="FILE", help="write the learning curves as one picture"
+    )
+    options = parser.parse_args(words)
+    from rich.console import Console
+
+    from tsbench.cli import tables
+    from tsbench.core.files import write_json, write_new
+    from tsbench.runs import results
+    from tsbench.viewer import comparison
+
+    parts = [results.read([places.entry(word)]) for word in options.runs]
+    everything = results.Results()
+    for part in parts:
+        everything.update(part)
+    console, pairs = Console(), comparison.pairs(everything)
+    tables.show_runs(console, dict(zip(options.runs, parts, strict=True)))
+    tables.show_pairs(console, pairs)
+    if options.png:
+        write_new(options.png, comparison.picture(everything))
+        console.print(f" {options.png}", markup=False, highlight=False, soft_wrap=True)
+    runs = [
+        {"run": word, "words": row.words, "score": row.score.as_dict() if row.score else None}
+        for word, part in zip(options.runs, parts, strict=True)
+        for row in part.rows.values()
+    ]
+    write_json(options.json, {"runs": runs, "pairs": [asdict(pair) for pair in pairs]})
+
+
 def _figures(words: Sequence[str]) -> None:
     parser = _parser("figures", json=False)
     what = "runs, entries, results folders, or folders with such in them"
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUNS", help=what)
+    parser.add_argument("runs", nargs="+", type=places.path, metavar="RUNS", help=what)
     out = "a new folder, which gets index.html and the figures as PNG, SVG and CSV"
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=out)
+    parser.add_argument("--out", type=places.path, required=True, metavar="DIR", help=out)
     options = parser.parse_args(words)
+    from rich.console import Console
+
     from tsbench.cli import tables
     from tsbench.runs import results
     from tsbench.viewer.paper import page
@@ -623,6 +713,8 @@ def _bench(words: Sequence[str]) -> None:
     parser.add_argument("--only", metavar="NAME", help="one comparison, such as laikago")
     parser.add_argument("--quick", action="store_true", help="a minute, with wider ranges")
     options = parser.parse_args(words)
+    from rich.console import Console
+
     from tsbench import bench
     from tsbench.bench import table
     from tsbench.core.files import write_json
@@ -638,13 +730,13 @@ def _bench(words: Sequence[str]) -> None:
 def _export(words: Sequence[str]) -> None:
     parser = _parser("export", json=False)
     what = "a run or policy directory, .onnx file, stable-baselines3 .zip, or .pt file of torch"
-    parser.add_argument("model", type=Path, metavar="MODEL", help=what)
+    parser.add_argument("model", type=places.path, metavar="MODEL", help=what)
     for_task = "that the policy is for, if it does not say so"
     parser.add_argument("task", nargs="?", metavar="task=NAME", help=for_task)
-    parser.add_argument("directory", type=Path, metavar="DIRECTORY", help="a new one")
+    parser.add_argument("directory", type=places.path, metavar="DIRECTORY", help="a new one")
     parser.add_argument("--method", metavar="NAME", help="that made the policy of another library")
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
-    parser.add_argument("--vecnormalize", type=Path, metavar="FILE", help=VECNORMALIZE)
+    parser.add_argument("--vecnormalize", type=places.path, metavar="FILE", help=VECNORMALIZE)
     parser.add_argument("--activation", metavar="NAME", help="of a .pt file's hidden layers")
     options = parser.parse_args(words)
     from tsbench import tasks
@@ -652,10 +744,12 @@ def _export(words: Sequence[str]) -> None:
     from tsbench.evaluation import deploy, export
 
     check_new(options.directory, parents=True)
+    if options.activation is not None and options.model.suffix not in (".pt", ".pth"):
+        raise TsbenchError(f"--activation is for a .pt file of torch, not for {options.model}")
     if options.model.is_dir():
         if options.method is not None:
             raise TsbenchError("--method is for a policy of another library")
-        policy, task = _policy(options.model, options.task, options.trust_sb3)
+        policy, task = _policy(options.model, options.task, options.trust_sb3, options.vecnormalize)
         differences = deploy.write(policy, task, options.directory)
     else:
         if options.task is None:
@@ -686,7 +780,7 @@ BOARD = Path("leaderboards")
 def _submit(words: Sequence[str]) -> int:
     parser = _parser("submit")
     flag = parser.add_argument
-    flag("runs", nargs="+", type=Path, metavar="RUN", help="a run, or an exported policy")
+    flag("runs", nargs="+", type=places.path, metavar="RUN", help="a run, or an exported policy")
     flag("--name", required=True, help="of the entry: its directory")
     flag("--author", required=True, action="append", metavar="NAME", help="one of the authors")
     flag("--licence", required=True, metavar="NAME", help="of the files, e.g. MIT")
@@ -696,7 +790,7 @@ def _submit(words: Sequence[str]) -> int:
     flag("--trained", type=_seeds, metavar="SEEDS", help="all that were trained, e.g. 0-9 (RUNs')")
     flag("--rescore", action="store_true", help="score again what has a score")
     flag("--check", action="store_true", help="run the whole verification and keep nothing")
-    flag("--board", type=Path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--board", type=places.path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
     flag("--threads", type=_threads, metavar="N", help="CPU threads (all)")
     told = parser.add_argument_group("of policies that tsbench did not train")
     told.add_argument("--seeds", type=_seeds, metavar="SEEDS", help="one for each RUN, e.g. 0-2")
@@ -705,6 +799,8 @@ def _submit(words: Sequence[str]) -> int:
     told.add_argument("--command", metavar="TEXT", help="that trained them")
     told.add_argument("--code", metavar="COMMIT", help="of the code that trained them")
     options = parser.parse_args(words)
+    from rich.console import Console
+
     from tsbench.core.files import write_json
     from tsbench.evaluation.evaluate import evaluate
     from tsbench.evaluation.protocol import V1
@@ -757,22 +853,25 @@ def _submit(words: Sequence[str]) -> int:
 def _verify(words: Sequence[str]) -> int:
     parser = _parser("verify")
     flag = parser.add_argument
-    flag("entries", nargs="*", type=Path, metavar="ENTRY", help="directories of entries")
+    what = "directories of entries, or kept ones (TASK/ENTRY)"
+    flag("entries", nargs="*", type=places.entry, metavar="ENTRY", help=what)
     flag("--all", action="store_true", help="every entry of the board")
     flag("--quick", action="store_true", help="replay the kept actions only, in seconds")
-    flag("--seed-file", type=Path, metavar="FILE", help="score from the hidden starts too")
+    flag("--seed-file", type=places.path, metavar="FILE", help="score from the hidden starts too")
     flag("--retrain", action="store_true", help="train again by the recorded configuration")
     flag("--record", action="store_true", help="keep the verdicts in verdicts/ of the board")
     flag("--retract", metavar="REASON", help="take the entries back, and keep that verdict")
     flag("--pull-request", metavar="BASE", help="the entries that HEAD adds to this commit")
-    flag("--in", dest="checkout", type=Path, default=Path(), metavar="DIRECTORY",
+    flag("--in", dest="checkout", type=places.path, default=Path(), metavar="DIRECTORY",
          help="with --pull-request: the repository (here)")  # fmt: skip
     flag("--comment", type=_new_file, metavar="FILE", help="write the verdicts as Markdown too")
-    flag("--board", type=Path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--board", type=places.path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
     flag("--threads", type=_threads, metavar="N", help="CPU threads (all)")
     options = parser.parse_args(words)
     if sum((bool(options.entries), options.all, options.pull_request is not None)) != 1:
         parser.error("one of ENTRY, --all and --pull-request BASE is needed")
+    from rich.console import Console
+
     from tsbench.core.files import write_json, write_new
     from tsbench.leaderboard import pull_request, verify
 
@@ -815,11 +914,13 @@ def _verify(words: Sequence[str]) -> int:
 def _leaderboard(words: Sequence[str]) -> None:
     parser = _parser("leaderboard", json=False)
     flag = parser.add_argument
-    flag("--board", type=Path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
-    flag("--html", type=Path, metavar="DIRECTORY", help="write the site there")
+    flag("--board", type=places.path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--html", type=places.path, metavar="DIRECTORY", help="write the site there")
     flag("--plain", action="store_true", help="a site without 3-D views and figures, in seconds")
     flag("--readme", action="store_true", help="write the tables into README.md of the board")
     options = parser.parse_args(words)
+    from rich.console import Console
+
     from tsbench.core.errors import os_errors
     from tsbench.core.files import write_whole
     from tsbench.leaderboard import page
@@ -884,6 +985,7 @@ VERBS = {
     "report": Verb("write one page about a run: plan, motion, score and learning", _report),
     "tune": Verb("search for good settings of a method, shared by processes", _tune),
     "collect": Verb("keep the scores, curves and best policies of many runs as data", _collect),
+    "compare": Verb("put runs beside each other: scores, learning curves, statistics", _compare),
     "figures": Verb("make the paper's figures and its table again, from runs or results", _figures),
     "export": Verb("write a policy for robots, or one of another library as tsbench's", _export),
     "submit": Verb("pack runs into an entry of the leaderboard", _submit),
@@ -891,4 +993,6 @@ VERBS = {
     "leaderboard": Verb("show the leaderboard: as tables, or as a site", _leaderboard),
     "bench": Verb("measure speed, beside alternatives", _bench),
     "list": Verb("name the tasks, methods and budgets", _list),
+    "describe": Verb("show a task's card: spaces, reward, constants, what was reached", _describe),
+    "doctor": Verb("say what works on this machine", _doctor),
 }

@@ -7,8 +7,10 @@ import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np  # takes half of the time in which `tsbench --help` answers
 
 LONGEST = 2000  # characters of a message
 
@@ -91,9 +93,17 @@ def unknown(
     if len(given) > 80:  # to compare it with the names would take long
         given = f"{given[:40]}...{given[-37:]}"
     message = f"unknown {kind} '{given}'; allowed: {', '.join(names) or 'none'}"
-    near = difflib.get_close_matches(given, names, n=1)
-    message += f" (did you mean '{near[0]}'?)" if near else ""
+    near = nearest(given, names)
+    message += f" (did you mean '{near}'?)" if near else ""
     return TsbenchError("; ".join([message, *causes]))
+
+
+def nearest(given: str, names: Iterable[str]) -> str | None:
+    """The name that is most like the given one, whatever the case of the letters; None if none is
+    like it."""
+    folded = {name.casefold(): name for name in names}
+    found = difflib.get_close_matches(given.casefold(), folded, n=1)
+    return folded[found[0]] if found else None
 
 
 @contextmanager

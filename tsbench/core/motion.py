@@ -76,6 +76,10 @@ class _Recording:
         """All arrays by name; their first axis is time."""
         return {name: getattr(self, name) for name in self.dimensions}
 
+    def __repr__(self) -> str:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in self.arrays.items())
+        return f"<{type(self).__name__} of {self.task}: {shapes}, every {self.timestep:g} s>"
+
     def save(self, path: Path | str) -> None:
         """Writes the recording to a file, atomically (see `write_whole`).
 
@@ -178,7 +182,7 @@ def _plain(value: np.ndarray) -> Any:
     return value.item() if value.ndim == 0 else value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Plan(_Recording):
     """The abstract trajectory of the planning stage.
 
@@ -206,7 +210,7 @@ class Plan(_Recording):
         return np.arange(len(self.states)) * self.timestep
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReferenceMotion(_Recording):
     """A plan as full poses at the control rate.
 
@@ -284,7 +288,7 @@ def read_motion(path: Path | str) -> Plan | ReferenceMotion:
     return ReferenceMotion.load(path) if found == ReferenceMotion.kind else Plan.load(path)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ActionLog(_Recording):
     """The actions and rewards of some episodes, from which their physics can be replayed.
 
@@ -307,7 +311,7 @@ class ActionLog(_Recording):
         return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Roadmap(_Recording):
     """A roadmap as it is drawn. Positions are the robot's, in the world frame in metres.
 

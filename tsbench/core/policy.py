@@ -121,6 +121,10 @@ class Policy:
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
 
+    def __repr__(self) -> str:
+        layers = " to ".join(map(str, self.info.layers))
+        return f"<Policy of {self.info.method} for {self.info.task}: {layers}>"
+
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Deterministic actions (..., m) in [-1, 1], float64, for observations (..., n).
 

@@ -1,8 +1,9 @@
-"""Durations and numbers as text."""
+"""Durations, numbers and commands as text."""
 
 from __future__ import annotations
 
 import math
+import shlex
 from typing import Any
 
 
@@ -13,9 +14,22 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
+def command(*words: object) -> str:
+    """A command of tsbench as a shell reads it, with quotes where they are needed."""
+    return shlex.join(["tsbench", *map(str, words)])
+
+
 def several(count: int, what: str) -> str:
     """A count of things: "1 seed", "2 seeds"."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def short(steps: int) -> str:
+    """A number of steps to three digits, with k for thousands and M for millions."""
+    for size, letter in ((1_000_000, "M"), (1_000, "k")):
+        if steps >= size:
+            return f"{steps / size:.3g}{letter}"
+    return str(steps)
 
 
 def number(value: Any) -> str:

@@ -123,12 +123,20 @@ def beside(score: Score) -> dict[str, dict[str, Any]]:
     Empty for a task without stored rows, and for a score by another protocol or with other
     constants of the task.
     """
+    return {
+        name: row
+        for name, row in comparable(score).items()
+        if name in POLICIES and score.protocol == V1.name
+    }
+
+
+def comparable(score: Score) -> dict[str, dict[str, Any]]:
+    """The stored rows, by protocol v1, that a score by any protocol may be seen beside: those of
+    its task with its constants. Empty for a task without stored rows."""
     content = (stored(score.origin.task) if score.origin.task in tasks.names() else None) or {}
-    if (score.protocol, score.origin.constants) != (
-        content.get("protocol"), content.get("constants"),
-    ):  # fmt: skip
-        return {}
-    return {name: content["rows"][name] for name in POLICIES}
+    same = content.get("constants") == score.origin.constants
+    rows: dict[str, dict[str, Any]] = content["rows"] if same else {}
+    return rows
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,8 @@ class Surface:
     forces_N: tuple[float, ...]  # noqa: N815  newtons
     headings_rad: tuple[float, ...]
     phases: tuple[int, ...]
-    survived: tuple[tuple[tuple[int, ...], ...], ...]
-    recovered: tuple[tuple[tuple[int, ...], ...], ...]
+    survived: tuple[tuple[tuple[int, ...], ...], ...] = field(repr=False)
+    recovered: tuple[tuple[tuple[int, ...], ...], ...] = field(repr=False)
 
     def __post_init__(self) -> None:
         shape = (len(self.forces_N), len(self.headings_rad), len(self.phases))
@@ -72,7 +72,7 @@ class Robustness:
     recovery_impulse_50_is_lower_bound: bool
     mass_scale: float
     push_duration_s: float
-    surface: Surface
+    surface: Surface = field(repr=False)
 
 
 @dataclass(frozen=True)

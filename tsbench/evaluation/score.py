@@ -38,7 +38,7 @@ class Summary:
     steps: float
     goal_distance: float
     measures: dict[str, float | None]
-    solved: tuple[int, ...]
+    solved: tuple[int, ...] = field(repr=False)
 
     def __post_init__(self) -> None:
         if not 1 <= self.episodes < 2**31:
@@ -88,6 +88,16 @@ class Score:
                 raise ValueError(f"{name} must be that of the perturbed starts")
         if self.nominal.measures.keys() != self.perturbed.measures.keys():
             raise ValueError("nominal.measures must have the names that perturbed.measures has")
+
+    def __repr__(self) -> str:
+        """The figures by which policies are compared, on one line; `as_dict` has all of them."""
+        solved = round(self.success * self.perturbed.episodes)
+        names = ("solved_reward", "normalized_reward", "against_plan")
+        figures = [f"{name} {getattr(self, name):.4g}" for name in names]
+        figures.append(f"survival_100N {self.robustness.survival_100N:.1%}")
+        verdict = f"SOLVED {solved} of {self.perturbed.episodes}"
+        what = f"{self.origin.task}, protocol {self.protocol}: {verdict}"
+        return f"<Score of {what}, {', '.join(figures)}>"
 
     def as_dict(self) -> dict[str, Any]:
         """The score as plain values, without the log."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from tsbench.core.task import Task
 from tsbench.core.words import number
-from tsbench.evaluation.references import beside
+from tsbench.evaluation.references import beside, comparable
 from tsbench.evaluation.score import Score, Summary
 
 FIGURES = {  # the meaning of each figure
@@ -35,6 +35,20 @@ def episode_rows(score: Score, task: Task[Any]) -> Iterator[tuple[str, str, str]
     yield f"spoiled by {task.mishap}", number(other.violations), number(own.violations)
     yield "steps", number(other.steps), number(own.steps)
     yield "distance at the end, m", number(other.goal_distance), number(own.goal_distance)
+
+
+REFERENCES = {  # rows of `evaluation.references` in words
+    "oracle": "best motion known",
+    "random": "policy random",
+    "zero": "policy zero",
+}
+
+
+def reference_rows(score: Score) -> Iterator[tuple[str, str, str]]:
+    """Rows of a reference, its `solved_reward` and its `success`, to compare a score with; none for
+    a task without stored references, or with other constants."""
+    for name, row in comparable(score).items():
+        yield REFERENCES.get(name, name), number(row["solved_reward"]), number(row["success"])
 
 
 def push_rows(score: Score) -> Iterator[tuple[str, str, str]]:

@@ -39,8 +39,8 @@ from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.replay import contradictions
 from tsbench.evaluation.score import Score
 from tsbench.runs import directory
-from tsbench.runs.config import SEEDS
 from tsbench.runs.directory import Record, RunDirectory, Stage
+from tsbench.runs.schema import SEEDS
 
 SCHEMA = 1  # of the manifest
 MANIFEST = "manifest.json"
@@ -297,6 +297,19 @@ class Entry:
         return f"{self.manifest.protocol}/{self.manifest.task}/{self.manifest.described.entry}"
 
 
+def read_manifest(path: Path) -> Manifest:
+    """The manifest of an entry alone, whose files are not looked at.
+
+    Raises:
+        TsbenchError: it is missing or damaged.
+    """
+    content = read_file(path / MANIFEST, MAX_MANIFEST, "manifest")
+    try:
+        return Manifest.decode(content)
+    except ValueError as error:
+        raise TsbenchError(f"damaged manifest {path / MANIFEST}: {error}") from None
+
+
 def read_entry(path: Path) -> Entry:
     """Reads an entry, and checks all that can be checked without playing an episode.
 
@@ -308,11 +321,7 @@ def read_entry(path: Path) -> Entry:
             belong together. The message names the file.
     """
     found = _files(path)
-    content = read_file(path / MANIFEST, MAX_MANIFEST, "manifest")
-    try:
-        manifest = Manifest.decode(content)
-    except ValueError as error:
-        raise TsbenchError(f"damaged manifest {path / MANIFEST}: {error}") from None
+    manifest = read_manifest(path)
     _check_place(path, manifest)
     for name in sorted(found ^ set(manifest.files)):
         missing = name in manifest.files

@@ -37,8 +37,8 @@ from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.evaluation.replay import compare, incomparable, replay
 from tsbench.evaluation.score import Score
 from tsbench.leaderboard.submission import MANIFEST, Claim, Entry, Kept, read_entry
-from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import RunConfig
 
 STATES = ("submitted", "replayed", "re-scored", "hidden-seed", "re-trained")
 RETRACTED = "retracted"

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import mink
 import mujoco
 import numpy as np
+
+from tsbench.core.lazy import Lazy
+
+if TYPE_CHECKING:
+    import mink
+else:
+    mink = Lazy("mink")  # loads as long as all else that a task needs
 
 SOLVER = "daqp"
 TOLERANCE = 1e-4  # m, within which a foot counts as at its target

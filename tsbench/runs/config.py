@@ -7,13 +7,10 @@ the result its types and turns every mistake in it into an error of one line.
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from importlib import import_module
-from importlib.resources.abc import Traversable
-from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_module
@@ -34,104 +31,14 @@ from omegaconf.errors import OmegaConfBaseException
 from tsbench import methods, tasks
 from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError, unknown
-from tsbench.core.method import Budget
 from tsbench.core.typed import typed, unknown_key
+from tsbench.runs.schema import RunConfig as RunConfig
+from tsbench.runs.schema import check_name, lacking
+from tsbench.runs.schema import names as names
 
-SEEDS = 2**32  # numpy and torch both take 32 bits
 CONFIGURATIONS = "tsbench.conf"
 VERSION_BASE = "1.3"  # the defaults of this Hydra release
 OPEN_MAPPINGS = ("task.training.", "task.constants.", "task.gpu.")
-ELSEWHERE = ("directory", "threads", "checkpoint", "loggers")  # keys that change no result
-DEVICES = "cpu, cuda, cuda:N, auto, warp"
-DEVICE = re.compile(r"cpu|cuda(:\d{1,3})?|auto|warp")
-
-
-@dataclass(frozen=True)
-class OnGPU:
-    """What a GPU changes of a task's configuration, since it steps many more environments at once.
-
-    A run's configuration has the changes in it, except where words on the command line say
-    otherwise.
-
-    Attributes:
-        budgets: some keys of some budgets, by name.
-        training: some PPO settings by kind of stage.
-    """
-
-    budgets: dict[str, dict[str, Any]] = field(default_factory=dict)
-    training: dict[str, dict[str, Any]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class TaskConfig:
-    """The content of `conf/task/NAME.yaml`.
-
-    Attributes:
-        name: a registered task.
-        budgets: the task's budgets, by name.
-        training: changes to the PPO settings by kind of stage (a method's `STAGES`).
-        constants: changed constants of the task, for studies; such a score cannot be ranked.
-        gpu: what a GPU changes of budgets and training.
-    """
-
-    name: str
-    budgets: dict[str, Budget]
-    training: dict[str, dict[str, Any]] = field(default_factory=dict)
-    constants: dict[str, Any] = field(default_factory=dict)
-    gpu: OnGPU = field(default_factory=OnGPU)
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """The configuration of a run, as `conf/config.yaml` composes it.
-
-    Attributes:
-        task: the task's configuration.
-        method: the method's name and its options.
-        seed: in [0, 2**32).
-        budget: a name among the task's budgets.
-        directory: the run directory, or None for the standard place.
-        threads: CPU threads, or None for all.
-        checkpoint: seconds of training between checkpoints.
-        device: "cpu", "cuda", "cuda:N", "warp" (a GPU's code on a CPU, for tests), or "auto".
-        deterministic: whether a device other than the CPU has to give the same bits each time.
-        loggers: what shows the figures of the training elsewhere (`runs.events.LOGGERS`).
-
-    Raises:
-        TsbenchError: a value is missing, unknown or out of range.
-    """
-
-    task: TaskConfig
-    method: dict[str, Any]
-    seed: int = 0
-    budget: str = "fast"
-    directory: str | None = None
-    threads: int | None = None
-    checkpoint: float = 30.0
-    device: str = "cpu"
-    deterministic: bool = False
-    loggers: tuple[str, ...] = ("tensorboard",)
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """The part of the configuration that determines a run's results."""
-        return {name: value for name, value in asdict(self).items() if name not in ELSEWHERE}
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.method.get("name"), str):
-            raise TsbenchError("method.name is missing")
-        if not 0 <= self.seed < SEEDS:
-            raise TsbenchError(f"seed must lie between 0 and {SEEDS - 1}, not {self.seed}")
-        if self.threads is not None and self.threads < 1:
-            raise TsbenchError(f"threads must be at least 1, not {self.threads}")
-        if not self.checkpoint >= 0.0:
-            raise TsbenchError(f"checkpoint must not be negative, not {self.checkpoint}")
-        if not DEVICE.fullmatch(self.device):
-            raise TsbenchError(f"device must be one of {DEVICES}, not {self.device!r}")
-        if self.deterministic and self.device == "cpu":
-            raise TsbenchError("deterministic: true is for a GPU; on the CPU every run is")
-        if self.budget not in self.task.budgets:
-            raise unknown("budget", self.budget, self.task.budgets)
 
 
 class PluginConfigurations(SearchPathPlugin):
@@ -173,13 +80,8 @@ def compose(words: Sequence[str]) -> RunConfig:
     config = parse(node, keys(words))
     files = {override.key_or_group: override.value() for override in overrides}
     for group, name in (("task", config.task.name), ("method", config.method["name"])):
-        _check_name(group, files.get(group, name), name)
+        check_name(group, files.get(group, name), name)
     return config
-
-
-def _check_name(group: str, file: str, name: str) -> None:
-    if name != file:
-        raise TsbenchError(f"conf/{group}/{file}.yaml must have name: {file}, not {name}")
 
 
 def parse(node: DictConfig, given: Collection[str]) -> RunConfig:
@@ -201,8 +103,8 @@ def parse(node: DictConfig, given: Collection[str]) -> RunConfig:
     if not config.device.startswith("cuda"):
         return config
     changed = asdict(config)
-    for group, names in vars(config.task.gpu).items():
-        for name, changes in names.items():
+    for group, members in vars(config.task.gpu).items():
+        for name, changes in members.items():
             for key, value in changes.items():
                 path = f"task.{group}.{name}.{key}"
                 if not any(path == word or path.startswith(f"{word}.") for word in given):
@@ -242,61 +144,21 @@ def parse_words(words: Sequence[str]) -> list[Override]:
     """The words, parsed by Hydra's grammar.
 
     Raises:
-        TsbenchError: a word cannot be read, or changes the name of a task or method alone.
+        TsbenchError: a word cannot be read, gives a key again, or changes the name of a task or
+            method alone.
     """
     with one_line_errors():
         overrides = list(OverridesParser.create().parse_overrides(list(words)))
+    given: dict[str, str | None] = {}
     for override in overrides:
+        key, line = override.get_key_element().lstrip("+~"), override.input_line
+        if key in given:
+            raise TsbenchError(f"{key} is given twice: {given[key]} and {line}")
+        given[key] = line
         group, _, rest = override.key_or_group.partition(".")
         if group in ("task", "method") and rest == "name":
             raise TsbenchError(f"{group}.name comes with {group}=NAME and cannot be changed alone")
     return overrides
-
-
-def names(group: str) -> tuple[str, ...]:
-    """The names of the configurations of a group ("task" or "method"), sorted."""
-    return tuple(sorted(_files(group)))
-
-
-def incomplete() -> tuple[str, ...]:
-    """A line for each task and method that can be made but not run, since it has no configuration
-    of its name."""
-    return tuple(
-        _lacking(group, name)
-        for group, registry in (("task", tasks), ("method", methods))
-        for name in registry.names()
-        if name not in _files(group)
-    )
-
-
-def _lacking(group: str, name: str) -> str:
-    return f"the {group} {name!r} cannot be run: its package lacks conf/{group}/{name}.yaml"
-
-
-def budgets(task: str) -> dict[str, Budget]:
-    """The budgets that a task's configuration offers; none without a configuration.
-
-    Raises:
-        TsbenchError: the configuration is wrong.
-    """
-    file = _files("task").get(task)
-    if file is None:
-        return {}
-    with one_line_errors():
-        plain = OmegaConf.to_container(OmegaConf.create(file.read_text("utf-8")), resolve=True)
-    config: TaskConfig = typed(TaskConfig, plain, "task")
-    _check_name("task", task, config.name)
-    return config.budgets
-
-
-def _files(group: str) -> dict[str, Traversable]:
-    """The files of a group by name. Of two files with one name it keeps the one Hydra takes."""
-    found: dict[str, Traversable] = {}
-    for folder in plugins.configurations(group):
-        for file in folder.iterdir():
-            if file.name.endswith(".yaml"):
-                found.setdefault(file.name.removesuffix(".yaml"), file)
-    return found
 
 
 @contextmanager
@@ -314,7 +176,7 @@ def one_line_errors() -> Iterator[None]:
         parts = missing.rpartition("/") if missing.startswith("hydra/") else missing.partition("/")
         registry = {"task": tasks, "method": methods}.get(parts[0])
         if registry is not None and parts[2] in registry.names():
-            raise TsbenchError(_lacking(parts[0], parts[2])) from None
+            raise TsbenchError(lacking(parts[0], parts[2])) from None
         raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__

@@ -22,7 +22,7 @@ from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
-from tsbench.runs.config import RunConfig
+from tsbench.runs.schema import RunConfig
 
 M = TypeVar("M", Plan, ReferenceMotion)
 

@@ -32,6 +32,7 @@ from tsbench.core.files import leftovers, taken, write_json, write_whole
 from tsbench.core.method import Problem
 from tsbench.core.policy import Policy
 from tsbench.core.typed import unknown_key
+from tsbench.core.words import command
 from tsbench.evaluation.evaluate import check_fit, evaluate
 from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.evaluation.score import Score
@@ -40,10 +41,10 @@ from tsbench.rl.devices import torch_device
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
 from tsbench.runs import events
-from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.runs.progress import progress_bar
 from tsbench.runs.provenance import check_provenance, identity, write_provenance
+from tsbench.runs.schema import RunConfig
 from tsbench.runs.workspace import RunWorkspace
 
 
@@ -96,7 +97,7 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
     with _locked(run.path), _explained(run):
         try:
             write_provenance(run, config, problem, words)
-            line = f"{' '.join(['tsbench run', *words])} -> {run.path}"
+            line = f"{command('run', *words)} -> {run.path}"
             return _work(config, problem, run, line, console or Console())
         except (TsbenchError, OSError) as error:
             if not run.trained and not isinstance(error, (NotFiniteError, PlanError)):
@@ -145,7 +146,7 @@ def resume(directory: Path, console: Console | None = None) -> Score:
             for folder in (run.path, run.checkpoints):
                 for path, _ in leftovers(folder) if folder.is_dir() else ():
                     path.unlink(missing_ok=True)
-            line = f"tsbench run resume={directory}"
+            line = command("run", f"resume={directory}")
             return _work(config, problem, run, line, console or Console())
 
 
@@ -255,7 +256,7 @@ def _dumped(path: Path, error: NotFiniteError) -> str:
 
 
 def _way_on(run: RunDirectory) -> str:
-    return f"; to go on: tsbench run resume={run.path}" if run.trained else ""
+    return f"; to go on: {command('run', f'resume={run.path}')}" if run.trained else ""
 
 
 def _train(
@@ -307,7 +308,7 @@ def _create(run: RunDirectory) -> None:
     if run.failure:
         raise taken(run.path, "a run whose plan has failed", elsewhere)
     if run.config_file.exists():
-        way_out = f"go on with resume={run.path}, or {elsewhere}"
+        way_out = f"go on with {command('run', f'resume={run.path}')}, or {elsewhere}"
         raise taken(run.path, "an unfinished run", way_out)
     raise taken(run.path, "other files", elsewhere)
 

@@ -10,12 +10,21 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 
 @contextmanager
-def progress_bar(console: Console, what: str) -> Iterator[Callable[[float], None]]:
+def progress_bar(
+    console: Console | None, what: str, shown: bool = True
+) -> Iterator[Callable[[float], None]]:
     """A progress bar on a terminal; elsewhere nothing is shown. Yields a function that takes the
-    share done, in [0, 1]."""
+    share done, in [0, 1].
+
+    Args:
+        console: the terminal; None for that of the error stream.
+        what: is done, in a word.
+        shown: False to show nothing at all.
+    """
+    console = console or Console(stderr=True)
     columns = (TextColumn("{task.description:<10}"), BarColumn(), TaskProgressColumn())
     with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
+        *columns, console=console, transient=True, disable=not (shown and console.is_terminal)
     ) as bar:
         row = bar.add_task(what, total=1.0)
         yield lambda share: bar.update(row, completed=share)

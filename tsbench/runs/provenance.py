@@ -21,10 +21,11 @@ from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_json, write_whole
 from tsbench.core.method import Problem
+from tsbench.core.words import command
 from tsbench.rl import processes
 from tsbench.rl.devices import CPU, described
-from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import RunConfig
 from tsbench.sim.model import compiled_hash
 
 PACKAGE = Path(str(files("tsbench")))
@@ -67,9 +68,8 @@ def write_provenance(
     }
     run.versions_file.unlink(missing_ok=True)
     write_json(run.versions_file, versions)
-    command = " ".join(["tsbench run", *words])
     content = yaml.safe_dump(asdict(config), sort_keys=False)
-    write_whole(run.config_file, f"# {command}\n{content}".encode())
+    write_whole(run.config_file, f"# {command('run', *words)}\n{content}".encode())
 
 
 def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import hashlib
 import io
 import json
 import re
+import shlex
 import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,9 +30,10 @@ from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import parse_json, read_file, write_whole
 from tsbench.core.typed import typed
+from tsbench.core.words import command
 from tsbench.evaluation.score import Score
-from tsbench.runs.config import ELSEWHERE, RunConfig
 from tsbench.runs.directory import MAX_SCORE, RunDirectory, Stage, read_metrics
+from tsbench.runs.schema import ELSEWHERE, RunConfig
 
 ROWS = "runs.jsonl"
 CURVES = "curves.npz"
@@ -105,7 +107,7 @@ class Result:
     @property
     def command(self) -> str:
         """That makes the run again."""
-        return f"tsbench run {' '.join(self.words)}"
+        return command("run", *self.words)
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -236,7 +238,7 @@ def _result(run: RunDirectory) -> Result:
         "method": config.method,
     }
     return Result(
-        words=words_of(config, run.command.removeprefix(COMMAND).split()),
+        words=words_of(config, _words(run.command.removeprefix(COMMAND))),
         task=task.name,
         method=config.method["name"],
         seed=config.seed,
@@ -249,6 +251,14 @@ def _result(run: RunDirectory) -> Result:
         score=record.score if record else None,
         failure=run.failure,
     )
+
+
+def _words(line: str) -> list[str]:
+    """The words of a command. Older runs have them without quotes."""
+    try:
+        return shlex.split(line)
+    except ValueError:
+        return line.split()
 
 
 def _stages(run: RunDirectory) -> tuple[Stage, ...]:

@@ -31,8 +31,8 @@ from tsbench.core.errors import NotFiniteError, PlanError, TsbenchError, os_erro
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
 from tsbench.runs import config, execute
-from tsbench.runs.config import RunConfig
 from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import RunConfig
 
 # No final run has these seeds: those of a table count up from 0.
 FIRST_SEED = 1_000_000

@@ -223,10 +223,10 @@ class GymVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                     f"them true, not {quoted(options['reset_mask'])}"
                 )
         _expect_options(options, "reset_mask")
-        if seed is None or isinstance(seed, (int, np.integer)):
-            super().reset(seed=None if seed is None else int(seed))
-        else:
+        if isinstance(seed, Sequence):
             self._seed_each(seed, mask)
+        else:
+            super().reset(seed=seed)
         if mask.all():
             observation = self.batched.reset()
         else:

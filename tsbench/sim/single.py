@@ -356,13 +356,7 @@ class ExactPhysics(TaskPhysics):
 
 
 class StillPhysics(TaskPhysics):
-    """A physics whose poses are set and never integrated.
-
-    Attributes:
-        plan_timestep: seconds between two poses.
-    """
-
-    plan_timestep: float
+    """A physics whose poses are set and never integrated."""
 
     def forward(self) -> None:
         super().forward()
@@ -372,7 +366,8 @@ class StillPhysics(TaskPhysics):
         pass
 
     def timestep(self) -> float:
-        return self.plan_timestep
+        """Seconds between two poses."""
+        return super().timestep() if self.task is None else self.task.mdp.timestep
 
 
 class Environment(control.Environment):
@@ -406,7 +401,6 @@ def environment(
     scratch = np.random.default_rng(0)  # before the first reset it stands at some start
     if isinstance(mdp, Planning):
         physics = StillPhysics.from_model(MjModel(mdp.task.spec().compile()))
-        physics.plan_timestep = mdp.timestep
         task: Adapter = PlanningAdapter(mdp, scratch)
         substeps = 1
     else:

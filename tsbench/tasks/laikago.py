@@ -16,7 +16,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy  # loads `scipy.interpolate` when it is used
 
 from tsbench.core.arrays import Array, array_namespace, filled, like, norm
 from tsbench.core.constants import constant
@@ -538,7 +538,7 @@ class Laikago(Plannable[LaikagoState]):
         steps = self.horizon
         times = np.arange(steps + 1) * self.timestep
         plan = self._continued(plan)
-        base = PchipInterpolator(plan.times, plan.states[:, :3])(times)
+        base = scipy.interpolate.PchipInterpolator(plan.times, plan.states[:, :3])(times)
         qpos, _ = poses(base, self._feet(plan, times))
         model = compiled("laikago")
         data = mujoco.MjData(model)

@@ -25,7 +25,7 @@ from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.evaluation.references import zero
 from tsbench.planning.roadmap import find_route
-from tsbench.runs import config, execute
+from tsbench.runs import config, execute, schema
 from tsbench.sim.kinematic import Planning, plan_along, rolled_out
 from tsbench.sim.model import fingerprint
 from tsbench.sim.promises import check_promises
@@ -247,7 +247,7 @@ class TaskContract(Contract):
         assert chosen.task.name == name
         assert {"smoke", chosen.budget} <= set(chosen.task.budgets)
         assert chosen.task.constants == {}
-        assert config.budgets(name) == chosen.task.budgets
+        assert schema.budgets(name) == chosen.task.budgets
         for budget in chosen.task.budgets:
             execute.prepare(config.compose([f"task={name}", f"budget={budget}"]))
 

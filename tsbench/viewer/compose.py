@@ -148,7 +148,7 @@ def _of_world(drawing: Drawing) -> list[Entry]:
 def _executed_actor(
     name: str, recording: Recording, colour: Rgb, note: str, lane: float = 0.0
 ) -> Actor:
-    ending = f"{recording.ending} after {recording.duration:.2f} s"
+    ending = f"{recording.ending} at {recording.duration:.2f} s"
     step = recording.task.timestep
     return Actor(name, recording.qpos, step, colour, note, lane=lane, ending=ending)
 

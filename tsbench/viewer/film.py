@@ -42,7 +42,9 @@ MAX_SHAPES = 10_000  # in one picture
 TRAIL_PIECES = 120  # pieces of a drawn path, at most
 PATH_WIDTH = 3.0  # pixels
 FIELD_OF_VIEW = 35.0  # degrees
-TEXT = (29, 39, 51)  # red, green, blue of 255
+TEXT, GROUND = (29, 39, 51), (244, 246, 248)  # red, green, blue of 255
+EDGE = 12  # pixels between the edge of a picture and what lies over it
+SMALLEST = 8  # pixels, of text
 
 
 def write_video(show: Show, path: Path, progress: Progress | None = None) -> None:
@@ -158,29 +160,44 @@ class Camera:
         everybody = self.show.actors
         whole = mujoco.MjrRect(0, 0, width, height)
         shots = [Shot(everybody, centre, distance, whole)]
-        if self.view.size / (distance * math.tan(math.radians(FIELD_OF_VIEW / 2))) < SMALL:
-            # The close-up covers the top where there is ground, the bottom in a flat world, whose
-            # goal may be at the top.
-            side = round(INSET * height)
-            left, below = width - side - 12, 12 if self.view.flat else height - side - 12
-            box = mujoco.MjrRect(left, below, side, side)
+        robot = self.view.size / (distance * math.tan(math.radians(FIELD_OF_VIEW / 2)))
+        box = self._corner(centre, distance) if robot < SMALL else None
+        if box is not None:
             shots.append(self._close(everybody, everybody[0], time, box))
         picture = Image.fromarray(self._take(shots, time))
         pen = ImageDraw.Draw(picture)
-        for shot in shots[1:]:
-            left, top = shot.box.left, height - shot.box.bottom - shot.box.height
-            pen.rectangle(
-                (left, top, left + shot.box.width, top + shot.box.height), outline="white", width=2
-            )
-        large, small = round(height / 30), round(height / 34)
-        pen.text((16, 12), self.show.title, TEXT, _font(large))
+        room = width - 3 * EDGE
+        if box is not None:
+            top = height - box.bottom - box.height
+            frame = (box.left, top, box.left + box.width, top + box.height)
+            pen.rectangle(frame, outline="white", width=2)
+            room -= box.width
+        large, small = height // 30, height // 34
+        _caption(pen, EDGE, EDGE, self.show.title, TEXT, large, room)
         for index, (actor, motion) in enumerate(zip(everybody, self.tracks, strict=True)):
             ended = actor.ending and time > motion.times[-1] - 1e-6
             text = f"{actor.name}: {actor.ending}" if ended else actor.name
-            place = (16, 16 + 1.5 * large * (index + 1))
-            pen.text(place, text, _bytes(actor.colour), _font(small))
-        pen.text((16, height - 16), f"{time:.2f} s", TEXT, _font(large), anchor="ls")
+            top = EDGE + 2 * large * (index + 1)
+            _caption(pen, EDGE, top, text, _bytes(actor.colour), small, room)
+        _caption(pen, EDGE, height - EDGE - 2 * large, f"{time:.2f} s", TEXT, large, room)
         return np.asarray(picture)
+
+    def _corner(self, target: Array, distance: float) -> mujoco.MjrRect | None:
+        """A corner on the right, for a close-up that covers neither a path nor a place. None if
+        there is no such corner."""
+        width, height = self.size
+        side = round(INSET * height)
+        forward, right, up = _axes(self.view)
+        offset = self.view.centres - target
+        scale = height / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
+        scale = scale / (distance - offset @ forward)
+        x, y = width / 2 + scale * (offset @ right), height / 2 + scale * (offset @ up)
+        reach, left = scale * self.view.radii, width - side - EDGE
+        for below in (height - side - EDGE, EDGE):
+            beside = (x + reach < left) | (y + reach < below) | (y - reach > below + side)
+            if beside.all():
+                return mujoco.MjrRect(left, below, side, side)
+        return None
 
     def portrait(self, actor: Actor, time: float) -> Picture:
         """A close-up of one actor alone at a time in seconds, (H, W, 3)."""
@@ -371,16 +388,38 @@ def _add_prop(world: mujoco.MjvScene, prop: Prop, time: float) -> None:
 def _distance(view: Framing, target: Array, ratio: float) -> float:
     """The camera's distance in metres from the target at which the whole show fits into a picture
     with `ratio` of width to height."""
-    forward = np.asarray(view.direction) / np.linalg.norm(view.direction)
-    right = np.cross([0.0, 0.0, 1.0], forward)
-    right /= np.linalg.norm(right)
-    up = np.cross(forward, right)
+    forward, right, up = _axes(view)
     offset, tall = view.centres - target, 0.9 * math.tan(math.radians(FIELD_OF_VIEW / 2))
     needed = np.maximum(
         (np.abs(offset @ right) + view.radii) / (tall * ratio),
         (np.abs(offset @ up) + view.radii) / tall,
     )
     return float(np.max(offset @ forward + needed))
+
+
+def _axes(view: Framing) -> tuple[Array, Array, Array]:
+    """Unit vectors towards the camera, to the right and up in the picture, each of shape (3,)."""
+    forward = np.asarray(view.direction) / np.linalg.norm(view.direction)
+    right = np.cross([0.0, 0.0, 1.0], forward)
+    right /= np.linalg.norm(right)
+    return forward, right, np.cross(forward, right)
+
+
+def _caption(
+    pen: ImageDraw.ImageDraw,
+    left: int,
+    top: int,
+    text: str,
+    colour: tuple[int, int, int],
+    size: int,
+    room: int,
+) -> None:
+    """Writes a line on a light ground, smaller if it would be wider than `room`; in pixels."""
+    while size > SMALLEST and pen.textlength(text, _font(size)) > room:
+        size -= 1
+    x0, y0, x1, y1 = pen.textbbox((left, top), text, _font(size))
+    pen.rounded_rectangle((x0 - 5, y0 - 3, x1 + 5, y1 + 3), 4, fill=GROUND)
+    pen.text((left, top), text, colour, _font(size))
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

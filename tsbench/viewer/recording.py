@@ -90,8 +90,8 @@ class Recording:
         if self.solved:
             return "solved"
         if len(self.actions) < self.task.horizon:
-            return self.task.mishap if self.violated else "ended early, not solved"
-        return f"time is up after {self.task.mishap}" if self.violated else "time is up, not solved"
+            return self.task.mishap if self.violated else "ended early, unsolved"
+        return f"{self.task.mishap if self.violated else 'unsolved'}, time is up"
 
     @cached_property
     def scheduled(self) -> NDArray[np.bool_] | None:

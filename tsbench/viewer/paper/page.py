@@ -15,6 +15,7 @@ import matplotlib
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import taken, write_new
+from tsbench.core.words import command
 from tsbench.runs.results import Results
 from tsbench.viewer.page import fill
 from tsbench.viewer.paper import ladder, learning, maps, plans, scores, strips, surfaces
@@ -169,6 +170,7 @@ def _section(exhibit: Exhibit, picture: bytes) -> str:
 def _commands(groups: Sequence[Group]) -> Iterator[str]:
     for group in groups:
         first = group.first
-        words = " ".join(word for word in first.words if not word.startswith("seed="))
+        words = [word for word in first.words if not word.startswith("seed=")]
         seeds = ",".join(str(row.seed) for row in group.rows)
-        yield f"<li><code>tsbench run -m {html.escape(words)} seed={seeds}</code></li>"
+        line = command("run", "-m", *words, f"seed={seeds}")
+        yield f"<li><code>{html.escape(line)}</code></li>"

@@ -1,0 +1,99 @@
+"""Runs beside each other: differences by hand, and the picture of their learning curves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tsbench.cli import verbs
+from tsbench.core.errors import TsbenchError
+from tsbench.runs.directory import Record, Stage
+from tsbench.runs.results import Curve, Result, Results
+from tsbench.viewer import comparison
+
+TASK = "rocket_navigation"
+
+
+@pytest.fixture(name="made")
+def made_fixture(invented_record: Callable[[str], Record]) -> Callable[..., Results]:
+    """A function from scores by method and seed to results with these."""
+    score = invented_record(TASK).score
+
+    def made(**methods: dict[int, float]) -> Results:
+        found = Results()
+        for method, runs in methods.items():
+            for seed, reward in runs.items():
+                summary = replace(score.perturbed, solved_reward=reward)
+                words = (f"task={TASK}", f"method={method}", "budget=fast", f"seed={seed}")
+                found.rows[words] = Result(
+                    words=words, task=TASK, method=method, seed=seed, budget="fast",
+                    distance=60.0, standard=True, commit=None, settings="",
+                    stages=(Stage("task", 100, steps=100, physics_substeps=100, seconds=1.0),),
+                    score=replace(score, solved_reward=reward, perturbed=summary),
+                )  # fmt: skip
+        return found
+
+    return made
+
+
+def test_a_difference_by_hand(made: Callable[..., Results]) -> None:
+    """Seeds 1 and 2 are common: (0.5 - 0.1 + 0.3 - 0.2) / 2 = 0.25. Of the four equally likely
+    choices of two signs, two give a mean as far from zero."""
+    (pair,) = comparison.pairs(made(prm={0: 0.9, 1: 0.5, 2: 0.3}, other={1: 0.1, 2: 0.2, 3: 0.7}))
+    assert (pair.first, pair.second, pair.seeds) == ("prm", "other", 2)
+    assert pair.difference is not None
+    assert pair.difference.mean == pytest.approx(0.25)
+    assert pair.difference.interval is None
+    assert pair.p_value == pytest.approx(0.5)
+
+
+def test_pairs_without_a_common_seed(made: Callable[..., Results]) -> None:
+    (pair,) = comparison.pairs(made(prm={0: 0.9}, other={1: 0.1}))
+    assert (pair.seeds, pair.difference, pair.p_value) == (0, None, None)
+    (pair,) = comparison.pairs(made(prm={1: 0.9}, other={1: 0.1}))
+    assert pair.difference is not None
+    assert pair.p_value is None  # nothing can be told from one seed
+
+
+def test_p_values_are_adjusted_for_the_number_of_pairs(made: Callable[..., Results]) -> None:
+    """Ten seeds that all differ by 0.1 or more: p = 2 / 2**10 of each pair, times three by Holm."""
+    seeds = range(10)
+    found = comparison.pairs(
+        made(
+            prm={seed: 0.9 + 0.001 * seed for seed in seeds},
+            a=dict.fromkeys(seeds, 0.5),
+            b={seed: 0.1 - 0.001 * seed for seed in seeds},
+        )
+    )
+    assert len(found) == 3
+    assert [pair.p_value for pair in found] == pytest.approx([3 * 2 / 2**10] * 3)
+    assert all(pair.difference and pair.difference.interval for pair in found)
+
+
+def test_the_picture(made: Callable[..., Results]) -> None:
+    found = made(prm={0: 0.9}, other={0: 0.1})
+    with pytest.raises(TsbenchError, match="no learning curves"):
+        comparison.picture(found)
+    steps = np.array([0.0, 50.0, 100.0])
+    for words in found.rows:
+        found.curves[words] = (Curve("task", steps, steps / 100.0, steps / 200.0),)
+    assert comparison.picture(found).startswith(b"\x89PNG")
+
+
+def test_compare_kept_entries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    words = ["compare", "rocket_navigation/twostage", "rocket_navigation/prm"]
+    assert verbs.main([*words, "--json", "found.json"]) == 0
+    text = capsys.readouterr().out
+    assert "rocket_navigation, seed by seed" in text
+    assert "twostage less prm" in text
+    assert (tmp_path / "found.json").exists()
+    assert verbs.main([*words, "--png", "x.png"]) == 2  # entries have no metrics
+    assert not (tmp_path / "x.png").exists()

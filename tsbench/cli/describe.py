@@ -1,0 +1,123 @@
+"""A task's card: what a policy sees and does, what it is rewarded for, and what was reached."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from rich.console import Console
+
+from tsbench import tasks
+from tsbench.cli.rows import show_rows
+from tsbench.cli.tables import kept_rows
+from tsbench.core.constants import SOURCES
+from tsbench.core.task import Task
+from tsbench.core.words import number
+from tsbench.evaluation import references
+from tsbench.evaluation.words import REFERENCES
+from tsbench.runs import schema
+
+
+def show(console: Console, name: str) -> dict[str, Any]:
+    """Prints a task's card.
+
+    Returns:
+        Its content as plain values.
+
+    Raises:
+        TsbenchError: there is no such task.
+    """
+    task = tasks.make(name)
+    facts, reached = dict(_facts(task)), list(_reached(task))
+    constants = list(_constants(task))
+    about = inspect.getdoc(sys.modules[type(task).__module__]) or ""
+    console.print(f"{name}, version {task.version}", style="bold", highlight=False)
+    console.print(_prose(about), markup=False, highlight=False)
+    show_rows(console, ("", ""), list(facts.items()), folded=1)
+    sources = "; ".join(f"{letter}: {meaning}" for letter, meaning in SOURCES.items())
+    if constants:
+        headers = ("constant", "value", "unit", "source", "meaning")
+        show_rows(console, headers, constants, folded=4)
+        console.print(f"Sources: {sources}.", markup=False, highlight=False)
+    if reached:
+        show_rows(console, ("by protocol v1", "solved_reward", "success"), reached)
+    line = f"tsbench run task={name} budget=smoke"
+    console.print(f"Try it: {line}", markup=False, highlight=False, soft_wrap=True)
+    keys = ("name", "value", "unit", "source", "meaning")
+    return {
+        "task": name,
+        "version": task.version,
+        "about": about,
+        **facts,
+        "constants": [dict(zip(keys, row, strict=True)) for row in constants],
+        "reached": [
+            dict(zip(("name", "solved_reward", "success"), row, strict=True)) for row in reached
+        ],
+    }
+
+
+def _facts(task: Task[Any]) -> Iterator[tuple[str, str]]:
+    own = type(task)
+    seen, done = _own(task, own.observation), _own(task, own.control)
+    yield "observation", f"{task.observation_size} numbers. {seen}".strip()
+    yield "action", f"{task.action_size} numbers in [-1, 1]. {done}".strip()
+    reward = _own(task, own.reward)
+    yield "reward", f"at most {number(task.max_reward)} a step. {reward}".strip()
+    if terms := _own(task, own.reward_terms):
+        yield "reward's terms", terms
+    seconds = task.horizon * task.timestep
+    yield "length", f"{task.horizon} steps of {number(task.timestep)} s: {number(seconds)} s"
+    for label, function in (
+        ("ends early", own.terminal),
+        ("violation", own.violated),
+        ("at the goal", own.reached),
+        ("solved", own.success),
+    ):
+        if words := _own(task, function):
+            yield label, words
+    yield from ((f"measure {name}", meaning) for name, meaning in task.measure_notes.items())
+    for name, budget in schema.budgets(task.name).items():
+        yield f"budget {name}", f"{budget.plan:,} steps to plan with, {budget.act:,} to act with"
+
+
+def _constants(task: Task[Any]) -> Iterator[tuple[str, str, str, str, str]]:
+    """Name, value, unit, source and meaning: of the function's constants, which words can change,
+    and of the records of constants in the task's module."""
+    for name, value in tasks.defaults(task.name).items():
+        yield name, _value(value), "", "", f"task.constants.{name}=... changes it, for studies"
+    for record in vars(sys.modules[type(task).__module__]).values():
+        if not dataclasses.is_dataclass(record) or isinstance(record, type):
+            continue
+        for field in dataclasses.fields(record):
+            if about := field.metadata.get("meaning"):
+                unit, source = field.metadata["unit"], field.metadata["source"]
+                yield field.name, _value(getattr(record, field.name)), unit, source, about
+
+
+def _reached(task: Task[Any]) -> Iterator[tuple[str, str, str]]:
+    stored = references.stored(task.name) or {"rows": {}}
+    for name, row in stored["rows"].items():
+        yield REFERENCES.get(name, name), number(row["solved_reward"]), number(row["success"])
+    yield from kept_rows(task)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(map(_value, value))
+    return number(value)
+
+
+def _own(task: Task[Any], function: Any) -> str:
+    """The text of a function's docstring before its sections, as one paragraph; "" for a function
+    that the task inherits from an interface, whose text says nothing of this task."""
+    if function.__module__ == Task.__module__:
+        return ""
+    return _prose(inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0])
+
+
+def _prose(text: str) -> str:
+    return re.sub(r"\s+", " ", text).strip()

@@ -1,0 +1,44 @@
+"""The kept entries that an installation brings, by short names such as `laikago_trot/twostage`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+# A wheel ships leaderboards/ inside the package; a checkout has it beside the package.
+FOLDERS = (Path(__file__).parents[1] / "leaderboards", Path(__file__).parents[2] / "leaderboards")
+BOARD = "v1"  # the protocol of the kept entries
+_SEED = re.compile(r"seed\d{1,10}")
+
+
+def entries() -> dict[str, Path]:
+    """The directories of the kept entries, by TASK/ENTRY, sorted."""
+    for folder in FOLDERS:
+        if (board := folder / BOARD).is_dir():
+            return {
+                f"{task.name}/{entry.name}": entry
+                for task in _folders(board)
+                for entry in _folders(task)
+            }
+    return {}
+
+
+def trainings(entry: Path) -> list[Path]:
+    """The directories of an entry's trainings, by seed; none for another directory."""
+    found = [one for one in _folders(entry) if _SEED.fullmatch(one.name)] if entry.is_dir() else []
+    return sorted(found, key=lambda one: int(one.name.removeprefix("seed")))
+
+
+def find(name: str) -> Path | None:
+    """The directory of a kept entry, TASK/ENTRY, or of one of its trainings, TASK/ENTRY/seedN; None
+    if there is no such entry."""
+    entry, _, seed = name.removeprefix(f"{BOARD}/").rstrip("/").partition("/seed")
+    place = entries().get(entry)
+    if place is None or not seed:
+        return place
+    return next((one for one in trainings(place) if one.name == f"seed{seed}"), None)
+
+
+def _folders(path: Path) -> Iterator[Path]:
+    yield from sorted(one for one in path.iterdir() if one.is_dir() and one.name[0] != ".")

@@ -1,0 +1,78 @@
+"""Runs beside each other: their learning curves in one picture, and their scores pair by pair."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from itertools import combinations
+
+import matplotlib
+
+from tsbench import tasks
+from tsbench.core.errors import TsbenchError
+from tsbench.evaluation.statistics import Difference, holm
+from tsbench.runs.results import Results
+from tsbench.viewer.paper import learning
+from tsbench.viewer.paper.exhibit import DPI, STYLE, by_task, difference, grouped
+
+FIGURE = "solved_reward"  # that is compared
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two groups of runs of one task, each of runs that differ in their seed alone.
+
+    Attributes:
+        task: name of the task.
+        first: label of the first group.
+        second: label of the second.
+        seeds: number of seeds that both have.
+        difference: `FIGURE` of the first less that of the second, over these seeds; None without
+            any.
+        p_value: of the difference, adjusted by Holm's method for the number of pairs; None with
+            fewer than two seeds.
+    """
+
+    task: str
+    first: str
+    second: str
+    seeds: int
+    difference: Difference | None
+    p_value: float | None
+
+
+def pairs(results: Results) -> list[Pair]:
+    """Every pair of groups of one task."""
+    found = [
+        (one, other, len(one.values(FIGURE).keys() & other.values(FIGURE).keys()))
+        for members in by_task(grouped(results.groups())).values()
+        for one, other in combinations(members, 2)
+    ]
+    differences = [difference(one, other, FIGURE) for one, other, _ in found]
+    tested = {
+        str(place): one.p_value
+        for place, (one, (_, _, seeds)) in enumerate(zip(differences, found, strict=True))
+        if one is not None and seeds > 1
+    }
+    adjusted = holm(tested)
+    return [
+        Pair(one.task, one.label, other.label, seeds, differences[place], adjusted.get(str(place)))
+        for place, (one, other, seeds) in enumerate(found)
+    ]
+
+
+def picture(results: Results) -> bytes:
+    """The learning curves of all runs as a PNG: a panel for each task, a colour for each method.
+
+    Raises:
+        TsbenchError: none of the runs has kept its metrics.
+    """
+    groups = grouped(results.groups())
+    made = {name: tasks.make(name) for name in by_task(groups)}
+    shown = next(learning.exhibits(results, groups, made), None)
+    if shown is None:
+        raise TsbenchError("there are no learning curves: none of these has its metrics.jsonl")
+    content = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        shown.figure.savefig(content, format="png", dpi=DPI, metadata={"Software": None})
+    return content.getvalue()
