@@ -9,7 +9,6 @@ them. After the pages are written, each task's best entry is drawn in 3-D into t
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import re
 import sys
@@ -22,7 +21,7 @@ import numpy as np
 
 from tsbench import gym, methods, tasks
 from tsbench.core import plugins
-from tsbench.core.constants import SOURCES
+from tsbench.core.constants import SOURCES, described
 from tsbench.core.files import write_whole
 from tsbench.core.task import MDP, Plannable, Task
 from tsbench.core.words import duration, number
@@ -64,8 +63,8 @@ def write_pages(folder: Path) -> list[Path]:
     found, left_out = board()
     before = (
         "# The board\n\nAll entries of `leaderboards/v1`, best first, with the policies `zero` and "
-        "`random` beside them. [leaderboard.md](leaderboard.md) says how to submit one, and "
-        "[evaluation.md](evaluation.md#what-the-figures-say) what each column means."
+        "`random` beside them. [The leaderboard](leaderboard.md) says how to submit one, and "
+        "[Evaluation](evaluation.md#what-the-figures-say) what each column means."
     )
     pages = {"board.md": page.markdown(found, left_out, before)}
     pages |= {f"tasks/{table.task}.md": task_card(table) for table in found}
@@ -263,20 +262,13 @@ def _budgets(name: str) -> str:
 def _constants(task: Task[Any]) -> list[str]:
     """The constants that decide a score, with units, meanings and sources where the code has
     them."""
-    rows, named = [], set()
-    for record in vars(sys.modules[type(task).__module__]).values():
-        if not dataclasses.is_dataclass(record) or isinstance(record, type):
-            continue
-        for field in dataclasses.fields(record):
-            if given := field.metadata.get("source"):
-                named.add(field.name)
-                told = field.metadata
-                value = _value(getattr(record, field.name))
-                rows.append((f"`{field.name}`", value, told["unit"], told["meaning"], given))
+    known = list(described(sys.modules[type(task).__module__]))
+    rows = [(f"`{c.name}`", _value(c.value), c.unit, c.meaning, c.source) for c in known]
+    named = {"name", *(constant.name for constant in known)}
     own = [
         (f"`{name}`", _value(value), "", "of this task", "")
         for name, value in task.constants().items()
-        if name not in named | {"name"}
+        if name not in named
     ]
     letters = "; ".join(f"{letter}: {words}" for letter, words in SOURCES.items())
     changed = ", ".join(f"`task.constants.{name}`" for name in tasks.defaults(task.name))
