@@ -15,6 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from rsl_rl.models import MLPModel, RNNModel
 from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensordict import TensorDict
 
@@ -151,7 +152,9 @@ def test_a_torch_module() -> None:
     assert module.training
     np.testing.assert_allclose(actions, by_torch(module.eval()), atol=1e-6)
     with torch.no_grad():
-        module[-1].bias += 1.0  # it is trained further
+        last = module[-1]
+        assert isinstance(last, torch.nn.Linear)
+        last.bias.add_(1.0)  # it is trained further
     np.testing.assert_array_equal(policy(OBSERVATIONS), actions)
     np.testing.assert_allclose(foreign.made(module.double(), TASK)(OBSERVATIONS), actions + 1.0)
 
@@ -170,6 +173,8 @@ def test_a_function_that_returns_tensors() -> None:
 
 class Window(torch.nn.Module):
     """Acts by the last two observations."""
+
+    before: torch.Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -277,7 +282,7 @@ def test_onnx_weights_beside_the_file(tmp_path: Path, monkeypatch: pytest.Monkey
     (tmp_path / "there" / "weights").write_bytes(bytes(80))
     other = foreign.load(path, TASK)
     np.testing.assert_array_equal(other(OBSERVATIONS), 0.0)
-    assert len({one.sha256 for one in (policy, whole, other)}) == 3  # type: ignore[union-attr]
+    assert len({one.sha256 for one in (policy, whole, other)}) == 3
 
 
 def test_onnx_weights_as_torch_writes_them(tmp_path: Path) -> None:
@@ -364,8 +369,15 @@ def test_stable_baselines3(baseline: tuple[Path, PPO]) -> None:
 def normalised(bound: float = 10.0) -> VecNormalize:
     """Statistics that are far from those of no normalisation."""
     venv = VecNormalize(DummyVecEnv([Spaces]), clip_obs=bound)
-    venv.obs_rms.mean, venv.obs_rms.var = RNG.normal(size=10), 1.0 + 3.0 * RNG.random(10)
+    seen = statistics_of(venv)
+    seen.mean, seen.var = RNG.normal(size=10), 1.0 + 3.0 * RNG.random(10)
     return venv
+
+
+def statistics_of(venv: VecNormalize) -> RunningMeanStd:
+    found: Any = venv.obs_rms  # or a mapping, where observations are dictionaries
+    assert isinstance(found, RunningMeanStd)
+    return found
 
 
 @pytest.mark.parametrize(("kind", "bound"), [(PPO, 10.0), (SAC, 0.5), (TQC, 10.0)])
@@ -376,7 +388,9 @@ def test_the_statistics_of_vecnormalize_belong_to_the_model(
     venv = normalised(bound)
     model = kind("MlpPolicy", venv, seed=0, device="cpu", **({"n_steps": 8} if kind is PPO else {}))
     model._setup_learn(8)  # what `learn` begins with
-    expected = model.predict(venv.normalize_obs(OBSERVATIONS).astype(np.float32), None, None, True)
+    seen = venv.normalize_obs(OBSERVATIONS)
+    assert isinstance(seen, np.ndarray)
+    expected = model.predict(seen.astype(np.float32), None, None, True)
     policy = foreign.made(model, TASK)
     np.testing.assert_allclose(policy(OBSERVATIONS), expected[0], atol=1e-6)
     plain = model.predict(OBSERVATIONS.astype(np.float32), deterministic=True)[0]
@@ -388,7 +402,7 @@ def test_the_statistics_of_vecnormalize_belong_to_the_model(
         foreign.load(path, TASK, kind.__name__)
     loaded = foreign.load(path, TASK, kind.__name__, statistics)
     np.testing.assert_allclose(loaded(OBSERVATIONS), expected[0], atol=1e-6)
-    venv.obs_rms.mean += 1.0
+    statistics_of(venv).mean += 1.0
     venv.save(str(statistics))
     other = foreign.load(path, TASK, kind.__name__, statistics)
     assert other.sha256 != loaded.sha256  # the file of the model is the same

@@ -109,12 +109,13 @@ def as_onnx(policy: Policy, task: Task[Any]) -> bytes:
         last = out
 
     def clip(bound: float, name: str) -> None:
-        arrays[f"-{name}"], arrays[name] = np.float32(-bound), np.float32(bound)
+        low, high = (np.array(edge, np.float32) for edge in (-bound, bound))
+        arrays[f"-{name}"], arrays[name] = low, high
         add("Clip", f"-{name}", name)
 
     if info.encoding == "symlog":
         nodes += [make.make_node(kind, list(names), [out]) for kind, names, out in _SYMLOG]
-        arrays["one"], last = np.float32(1.0), "encoded"
+        arrays["one"], last = np.array(1.0, np.float32), "encoded"
     add("Sub", "mean")
     add("Div", "scale")
     if info.bound is not None:
