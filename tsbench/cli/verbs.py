@@ -537,6 +537,8 @@ def _view(words: Sequence[str]) -> None:
     options = parser.parse_args(words)
     if (options.what is None) == (options.compare is None):
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
+    from rich.console import Console
+
     from tsbench.core.files import write_new
     from tsbench.runs.progress import progress_bar
     from tsbench.viewer import film, page, serve
