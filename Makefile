@@ -3,6 +3,7 @@
 # make check    set up, then lint, format and types
 # make setup    the virtual environment .venv with the pinned packages
 # make faults   set up, then kill, starve and poison runs: N=50 kills, and every other fault once
+# make docs     set up, then build the documentation: build/docs/index.html
 # make bench    measure speed
 # make compare  measure speed beside other libraries, such as ARGS='--only sb3'
 # make gpu-bundle  collect what a machine with a GPU and without a network lacks
@@ -20,6 +21,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
 EXTRAS := $(VENV)/.extras
+SITE := $(VENV)/.docs
 PYTHON ?= $(firstword $(foreach name,python3.12 python3.11 python3,\
 	$(shell $(name) -c 'import sys; (3, 11) <= sys.version_info < (3, 13) and print("$(name)")' 2>/dev/null)))
 ARGS ?=
@@ -33,7 +35,7 @@ quoted = '$(subst ','\'',$(call plain,$1))'
 given = $(filter-out ARGS=% PYTHON=% N=% OUT=%,$(subst \$(space),<blank>,$(MAKEOVERRIDES)))
 words = $(if $(filter task=%,$(given)),,task=laikago_trot) $(foreach word,$(given),$(call quoted,$(word)))
 
-.PHONY: help setup system run test check format faults bench compare gpu-bundle study clean
+.PHONY: help setup system run test check format faults docs bench compare gpu-bundle study clean
 
 help:
 	@sed -n 's/^# \(make .*\)/  \1/p' Makefile
@@ -51,6 +53,11 @@ $(STAMP): pyproject.toml constraints.txt
 # The libraries that benchmarks/compare.py needs and a run does not.
 $(EXTRAS): $(STAMP)
 	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev,bench]'
+	@touch $@
+
+# What builds the documentation and a run does not need.
+$(SITE): $(STAMP)
+	@$(BIN)/python -m pip install -qq --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $@
 
 run: setup
@@ -76,6 +83,10 @@ N ?= 50
 faults: setup
 	$(BIN)/python tests/faults.py --kills $(N) $(ARGS)
 
+docs: setup $(SITE)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs build/docs $(ARGS)
+	@echo "tsbench: build/docs/index.html"
+
 bench: setup
 	@$(BIN)/tsbench bench $(ARGS)
 
@@ -90,5 +101,5 @@ study: setup
 	@$(BIN)/python benchmarks/study.py benchmarks/paper.txt --out $(OUT) $(ARGS)
 
 clean:
-	rm -rf $(VENV) build dist screenshots .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist docs/board.md docs/methods docs/tasks screenshots .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find tsbench tests -name __pycache__ -type d -prune -exec rm -rf {} +

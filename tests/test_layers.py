@@ -37,7 +37,7 @@ ROOFS = {"cli", "gym", "testing", "tsbench", "__main__"}
 
 # The rooms, or single files of rooms, that may import each package.
 ONLY_IN: dict[str, set[str]] = {
-    "torch": {"rl", "sim.device", "sim.warp", "bench.gpu", "testing"},
+    "torch": {"rl", "sim.device", "sim.warp", "bench.gpu", "testing", "evaluation.on_robot"},
     "warp": {"sim.warp"},
     "mujoco_warp": {"sim.warp"},
     "rsl_rl": {"rl", "testing"},
@@ -48,7 +48,7 @@ ONLY_IN: dict[str, set[str]] = {
     "dm_control": {"sim", "tsbench"},
     "dm_env": {"sim", "testing"},
     "mujoco": {"core.task", "planning", "sim", "tasks", "viewer", "bench"},
-    "safetensors": {"core.policy", "runs.checkpoint"},
+    "safetensors": {"core.policy", "runs.checkpoint", "evaluation.on_robot"},
     "optuna": {"runs.tune"},
     "hydra": {"runs.config", "cli.launch"},
     "omegaconf": {"runs.config", "cli.launch"},
@@ -57,6 +57,8 @@ ONLY_IN: dict[str, set[str]] = {
     "matplotlib": {"viewer"},
     "pytest": {"testing"},
     "tensorboard": {"runs.events"},
+    "wandb": {"runs.events"},
+    "mlflow": {"runs.events"},
     "rich": {"runs.progress", "runs.workspace", "runs.execute", "cli", "bench"},
 }
 # The rooms that may delay an import until they need it.

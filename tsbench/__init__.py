@@ -8,9 +8,11 @@ time_step = environment.reset()
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-from tsbench.core.errors import TsbenchError, unknown
+from tsbench.core.errors import TsbenchError, quoted, unknown
 from tsbench.gl import choose_backend
 
 if TYPE_CHECKING:
@@ -18,13 +20,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import numpy as np
-    from dm_control.rl.control import Environment
 
     from tsbench.core.motion import ReferenceMotion
     from tsbench.core.policy import Policy
     from tsbench.evaluation.score import Score
     from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.push import Push
+    from tsbench.sim.single import Environment
 
     __version__: str
 
@@ -77,6 +79,10 @@ def load(
 ) -> Environment:
     """One dm_control environment of a task.
 
+    It keeps dm_env's contract: a step before the first reset, or after the end of an episode,
+    begins a new episode and ignores the action. `environment.task.random` is its only generator,
+    and `environment.physics.get_state()` its whole state, to which `set_state` returns.
+
     Args:
         name: a task's name, as `list_tasks` gives it.
         variant: "planning" for the kinematic variant, "imitation" for the variant whose reward
@@ -93,7 +99,8 @@ def load(
     """
     from tsbench.sim.single import environment
 
-    mdp = _variant(name, variant, reference, seed, perturbed, push, constants)
+    _check_seed(seed)
+    mdp = _variant(name, variant, reference, perturbed, push, constants)
     return environment(mdp, seed, perturbed=perturbed, push=push)
 
 
@@ -103,7 +110,7 @@ def load_batched(
     *,
     count: int,
     reference: ReferenceMotion | None = None,
-    seed: int = 0,
+    seed: int | Sequence[int | None] | None = 0,
     perturbed: bool = False,
     push: Push | None = None,
     threads: int | None = None,
@@ -113,19 +120,26 @@ def load_batched(
 
     Args:
         count: number of environments, at least 1.
+        seed: one seed for all starts, None for fresh entropy, or a list of one for each
+            environment, which then begins as `load` with that seed does.
         push: one push for all environments, or with a leading axis (count,) one for each.
         threads: CPU threads of the physics; None takes all cores.
 
     Raises:
-        TsbenchError: `count` is less than 1. Beyond that, as `load`.
+        TsbenchError: `count` is less than 1, or there are more or fewer seeds. Beyond that, as
+            `load`.
     """
     from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.kinematic import Planning
     from tsbench.sim.physics import Physics
 
-    mdp = _variant(name, variant, reference, seed, perturbed, push, constants)
+    for one in seed if isinstance(seed, Sequence) else [seed]:
+        _check_seed(one)
+    mdp = _variant(name, variant, reference, perturbed, push, constants)
     if count < 1:
         raise TsbenchError(f"count must be at least 1, not {count}")
+    if isinstance(seed, Sequence) and len(seed) != count:
+        raise TsbenchError(f"a list of seeds must have one for each of {count}, not {len(seed)}")
     dynamics: Any = mdp
     if not isinstance(mdp, Planning):
         dynamics = Physics(mdp, count, threads=threads, perturbed=perturbed, push=push)
@@ -144,9 +158,9 @@ def evaluate(
 
     Args:
         policy: a `tsbench.core.policy.Policy`, the directory of one, an ONNX file, "zero" or
-            "random", a stable-baselines3 model, or any function of one observation (o,) that
-            returns one action (a,) in [-1, 1]. For a file that stable-baselines3 saved there is
-            `tsbench.evaluation.foreign.from_sb3`.
+            "random", a model of stable-baselines3 or rsl-rl, a torch module, or any function of one
+            observation (o,) that returns one action (a,) in [-1, 1]. For a file that
+            stable-baselines3 saved there is `tsbench.evaluation.foreign.from_sb3`.
         task: its name.
         protocol: "v1", or "smoke" for a first look that cannot be ranked.
         threads: CPU threads of the physics; None takes all cores. The score does not depend on it.
@@ -170,24 +184,28 @@ def evaluate(
     if isinstance(policy, (str, Path)):
         policy = references.named(Path(policy), made) or foreign.load(Path(policy), made)
     if not isinstance(policy, (Policy, foreign.ForeignPolicy)):
-        if callable(policy):
-            policy = foreign.from_function(policy, made)
-        elif hasattr(policy, "predict"):
-            policy = foreign.from_sb3_model(policy, made)
-        else:
-            kind = type(policy).__name__
-            raise TsbenchError(f"a policy must be a model, a file or a function, not {kind}")
+        policy = foreign.made(policy, made)
     with progress_bar(None, "evaluate", shown=progress) as told:
         return score(
             policy, made, protocol=protocols.PROTOCOLS[protocol], threads=threads, progress=told
         )
 
 
+def _check_seed(seed: int | None) -> None:
+    if seed is None:
+        return
+    try:
+        negative = operator.index(seed) < 0
+    except TypeError:
+        raise TsbenchError(f"seed must be a whole number or None, not {quoted(seed)}") from None
+    if negative:
+        raise TsbenchError(f"seed must not be negative, not {seed}")
+
+
 def _variant(
     name: str,
     variant: str | None,
     reference: ReferenceMotion | None,
-    seed: int | None,
     perturbed: bool,
     push: Push | None,
     constants: dict[str, Any],
@@ -203,8 +221,6 @@ def _variant(
         if not isinstance(value, (kind, type(None))):
             given = type(value).__name__
             raise TsbenchError(f"{word} must be a {kind.__name__} or None, not {given}")
-    if seed is not None and seed < 0:
-        raise TsbenchError(f"seed must not be negative, not {seed}")
     if variant is None:
         return task
     if variant == "planning":

@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+
+import pytest
 
 from tsbench.cli.launch import directory
 from tsbench.runs import config
@@ -45,24 +48,68 @@ ConfigStore.instance().store(group="hydra/launcher", name="elsewhere", node=Conf
 """
 
 
-def test_jobs_in_another_process(tmp_path: Path) -> None:
-    """All jobs finish with their pages, and the error of the failed one is reported."""
-    plugins = tmp_path / "plugins"
-    (plugins / "hydra_plugins").mkdir(parents=True)
-    (plugins / "hydra_plugins" / "elsewhere.py").write_text(PLUGIN)
-    words = [[*WORDS[:-1], f"seed={seed}"] for seed in (0, 1)]
-    places = [str(directory(config.compose(one), one)) for one in words]
-    (tmp_path / places[0]).mkdir(parents=True)
-    (tmp_path / places[0] / "notes.txt").touch()
-    path = os.pathsep.join([str(plugins), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-m", "tsbench", "run", "-m", "hydra/launcher=elsewhere", *WORDS],
-        cwd=tmp_path,
+RAY = "TSBENCH_TEST_RAY"  # set to test with Ray, in an environment that has hydra-ray-launcher
+POLICY = "policy.safetensors"
+
+
+def start(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """`tsbench run` in a folder, with the packages in its `plugins`."""
+    path = os.pathsep.join([str(folder / "plugins"), *sys.path])
+    return subprocess.run(
+        [sys.executable, "-m", "tsbench", "run", *words],
+        cwd=folder,
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
     )
-    line = f"tsbench: {places[0]} holds other files and nothing is overwritten: "
-    assert (done.returncode, done.stderr.splitlines()[-1][: len(line)]) == (2, line)
-    assert (tmp_path / places[1] / "score.json").exists()
-    assert (tmp_path / places[1] / "report.html").exists()
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The second job of the sweeps, run by itself."""
+    folder = tmp_path_factory.mktemp("alone")
+    done = start(folder, *WORDS[:-1], "seed=1", "directory=run")
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+@pytest.mark.parametrize(
+    ("launcher", "words"),
+    [
+        ("elsewhere", ()),
+        ("joblib", ("hydra.launcher.n_jobs=2",)),
+        ("ray", ("+hydra.launcher.ray.init.num_cpus=2",)),
+    ],
+)
+def test_jobs_in_other_processes(
+    launcher: str, words: Sequence[str], alone: Path, tmp_path: Path
+) -> None:
+    """All jobs finish with their pages and with the bits of a run alone, and the error of the
+    failed one is reported. A second start of the sweep does not repeat what is finished."""
+    if launcher == "joblib":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs tsbench[joblib]")
+    if launcher == "ray" and not os.environ.get(RAY):
+        pytest.skip(f"{RAY} is not set: Ray takes 360 MB and older packages than constraints.txt")
+    plugins = tmp_path / "plugins"
+    (plugins / "hydra_plugins").mkdir(parents=True)
+    (plugins / "hydra_plugins" / "elsewhere.py").write_text(PLUGIN)
+    jobs = [[*WORDS[:-1], f"seed={seed}"] for seed in (0, 1)]
+    places = [str(directory(config.compose(job), job)) for job in jobs]
+    (tmp_path / places[0]).mkdir(parents=True)
+    (tmp_path / places[0] / "notes.txt").touch()
+
+    sweep = ("-m", f"hydra/launcher={launcher}", *words, *WORDS)
+    done = start(tmp_path, *sweep)
+    line = f"{places[0]} holds other files and nothing is overwritten: "
+    assert done.returncode == 2
+    assert line in done.stderr.splitlines()[-1]
+    finished = tmp_path / places[1]
+    assert (finished / "score.json").exists()
+    assert (finished / "report.html").exists()
+    written = (finished / "score.json").stat().st_mtime_ns
+    (tmp_path / places[0] / "notes.txt").unlink()
+    again = start(tmp_path, *sweep)
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / places[0] / "score.json").exists()
+    assert (finished / "score.json").stat().st_mtime_ns == written
+    assert (finished / POLICY).read_bytes() == (alone / POLICY).read_bytes()

@@ -13,8 +13,10 @@ import onnx
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from rsl_rl.models import MLPModel, RNNModel
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from tensordict import TensorDict
 
 import tsbench.gym
 from tsbench import tasks
@@ -57,7 +59,7 @@ def test_a_torch_module(last: tuple[torch.nn.Module, ...], tmp_path: Path) -> No
     ("make", "reason"),
     [
         (lambda: network(torch.nn.Softmax(dim=-1)), "holds a 'Softmax'"),
-        (lambda: torch.nn.LSTM(SIZE, ACTIONS), "holds a 'LSTM'"),
+        (lambda: torch.nn.LSTM(SIZE, ACTIONS), "the module LSTM has a memory"),
         (lambda: torch.nn.Sequential(torch.nn.Tanh()), "begins with tanh"),
         (lambda: torch.nn.Sequential(torch.nn.Linear(SIZE, 3)), "to 3 actions"),
         (lambda: network(torch.nn.ReLU()), "applies relu to its actions"),
@@ -137,6 +139,95 @@ def test_a_state_dict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     torch.save(module, path)  # a pickled module, which would run code
     assert cli.main([*words[:3], f"{out}2", *words[4:], "--activation", "elu"]) == 2
     assert "holds no state dict of plain tensors" in capsys.readouterr().err
+
+
+def actor(distribution: str = "GaussianDistribution", kind: type[MLPModel] = MLPModel) -> MLPModel:
+    """An actor of rsl-rl with a normaliser that has seen something."""
+    torch.manual_seed(0)
+    seen = TensorDict({"policy": 3.0 + 5.0 * torch.randn(50, SIZE)}, batch_size=[50])
+    model = kind(
+        seen, {"actor": ["policy"]}, "actor", ACTIONS, [8, 8], "elu", True,
+        {"class_name": f"rsl_rl.modules.{distribution}"},
+    )  # fmt: skip
+    model.update_normalization(seen)
+    return model.eval()
+
+
+def acts(model: MLPModel) -> np.ndarray:
+    given = torch.as_tensor(OBSERVATIONS, dtype=torch.float32)
+    with torch.no_grad():
+        actions = model(TensorDict({"policy": given}, batch_size=[50])).numpy()
+    return np.clip(actions, -1.0, 1.0)
+
+
+def releases(model: MLPModel) -> dict[str, dict[str, Any]]:
+    """An actor's checkpoint as releases of rsl-rl keep it."""
+    tensors = model.state_dict()
+    layers = {
+        name.replace("mlp.", "actor."): tensor
+        for name, tensor in tensors.items() if name.startswith("mlp.")
+    }  # fmt: skip
+    layers |= {"critic.0.weight": torch.ones(4, SIZE), "std": torch.ones(ACTIONS)}
+    normaliser = {
+        name.partition(".")[2]: tensor
+        for name, tensor in tensors.items() if name.startswith("obs_normalizer.")
+    }  # fmt: skip
+    more = {"optimizer_state_dict": {"state": {}, "param_groups": []}, "iter": 3, "infos": None}
+    own = {f"actor_obs_normalizer.{name}": tensor for name, tensor in normaliser.items()}
+    own |= {f"critic_obs_normalizer.{name}": tensor for name, tensor in normaliser.items()}
+    return {
+        "2": {"model_state_dict": layers, "obs_norm_state_dict": normaliser, **more},
+        "3": {"model_state_dict": {**layers, **own}, **more},
+        "5": {"actor_state_dict": tensors, "critic_state_dict": {"x": torch.ones(3)}, **more},
+    }
+
+
+@pytest.mark.parametrize("release", ["2", "3", "5"])
+def test_a_checkpoint_of_rsl_rl(release: str, tmp_path: Path) -> None:
+    """The actor with its normaliser, without the critic."""
+    model, path = actor(), tmp_path / "model_3.pt"
+    torch.save(releases(model)[release], path)
+    found = export.read(path, TASK, activation="elu")
+    policy, difference = export.policy_of(found, TASK, "mine")
+    assert difference < 1e-5
+    np.testing.assert_allclose(policy(OBSERVATIONS), acts(model), atol=1e-5)
+
+
+def test_an_actor_and_the_exports_of_rsl_rl(tmp_path: Path) -> None:
+    model = actor()
+    policy, _ = export.policy_of(export.from_torch(model, SIZE), TASK, "mine")
+    np.testing.assert_allclose(policy(OBSERVATIONS), acts(model), atol=1e-5)
+    network, path = model.as_onnx(verbose=False), tmp_path / "policy.onnx"
+    torch.onnx.export(
+        network, network.get_dummy_inputs(), str(path), opset_version=18, dynamo=True,
+        input_names=network.input_names, output_names=network.output_names,
+    )  # fmt: skip
+    policy, _ = export.policy_of(export.read(path, TASK), TASK, "mine")
+    np.testing.assert_allclose(policy(OBSERVATIONS), acts(model), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("saved", "reason"),
+    [
+        (lambda: releases(actor("BetaDistribution"))["5"], "to 4 actions"),
+        (lambda: releases(actor(kind=RNNModel))["5"], "holds an actor with a memory"),
+        (lambda: {"actor_state_dict": {"cnn.kernel": torch.ones(3)}}, "'cnn.kernel', which is no"),
+        (lambda: {"actor_state_dict": {"obs_normalizer.x": torch.ones(3)}}, "of another kind"),
+    ],
+)
+def test_checkpoints_that_are_refused(
+    saved: Callable[[], dict[str, Any]], reason: str, tmp_path: Path
+) -> None:
+    torch.save(saved(), tmp_path / "model_3.pt")
+    with pytest.raises(TsbenchError, match=reason) as caught:
+        export.policy_of(export.read(tmp_path / "model_3.pt", TASK, activation="elu"), TASK, "mine")
+    assert "\n" not in str(caught.value)
+
+
+def test_torchscript_is_refused(tmp_path: Path) -> None:
+    torch.jit.script(actor().as_jit()).save(str(tmp_path / "policy.pt"))
+    with pytest.raises(TsbenchError, match="is TorchScript, which is code"):
+        export.read(tmp_path / "policy.pt", TASK, activation="elu")
 
 
 def environment() -> gymnasium.Env[Any, Any]:

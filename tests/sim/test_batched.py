@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Callable
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pytest
 
 import tsbench
-from tsbench import tasks
+from tsbench import TsbenchError, tasks
 from tsbench.core.motion import ReferenceMotion
 from tsbench.core.state import Start
 from tsbench.sim.batched import BatchedEnvironment
@@ -180,3 +182,181 @@ def test_steps_count_from_where_the_reference_is(
         batch.step(np.zeros((200, 12)))
         np.testing.assert_allclose(batch.state.time, batch.steps / 30)
     assert np.any(batch.steps[last] > 6)
+
+
+# A list of seeds: each row has a generator of its own.
+
+
+@pytest.mark.parametrize("seeds", [[5, 6, 5], (7, None, 9)])
+def test_a_seed_for_each_row(seeds: Any) -> None:
+    """Its episodes, the second included, begin like those of an environment with that seed."""
+    many = tsbench.load_batched("laikago_walk", count=3, seed=seeds, perturbed=True, threads=1)
+    one = tsbench.load("laikago_walk", seed=seeds[2], perturbed=True)
+    starts = []
+    for _ in range(2):
+        starts.append(many.reset())
+        assert starts[-1][2].tobytes() == next(iter(one.reset().observation.values())).tobytes()
+        assert (starts[-1][0].tobytes() == starts[-1][2].tobytes()) == (seeds[0] == seeds[2])
+        many.step(np.zeros((3, 12)))
+    assert not np.any(starts[0][1][:12] == starts[1][1][:12])
+    before = many.snapshot()
+    later = many.reset()
+    many.restore(before)
+    assert many.reset().tobytes() == later.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        ([1], "a list of seeds must have one for each of 2, not 1"),
+        ([1, -2], "seed must not be negative, not -2"),
+        ([1, "two"], "seed must be a whole number or None, not 'two'"),
+        ("5", "seed must be a whole number or None, not '5'"),
+        (1.5, "seed must be a whole number or None, not 1.5"),
+    ],
+)
+def test_refused_seeds(seed: Any, message: str) -> None:
+    with pytest.raises(TsbenchError, match=message):
+        tsbench.load_batched("rocket_navigation", count=2, seed=seed)
+    if not isinstance(seed, list):
+        with pytest.raises(TsbenchError, match=message):
+            tsbench.load("rocket_navigation", seed=seed)
+
+
+# Nothing is stepped that has no state to go on from.
+
+
+@pytest.mark.parametrize("variant", [None, "planning"])
+def test_a_step_before_the_first_reset(variant: tsbench.Variant | None) -> None:
+    many = tsbench.load_batched("rocket_navigation", variant, count=2)
+    size = many.mdp.action_size
+    for refused in (
+        lambda: many.step(np.zeros((2, size))),
+        lambda: many.begin(np.array([0])),
+        lambda: many.restore({}),
+    ):
+        with pytest.raises(TsbenchError, match=r"call reset\(\) first: .* never reset"):
+            refused()
+
+
+@pytest.mark.parametrize("variant", [None, "planning"])
+@pytest.mark.parametrize("refused", [np.nan, np.zeros((2, 9)), [["up", "down"]] * 2, None])
+def test_a_refused_action_changes_nothing(variant: tsbench.Variant | None, refused: Any) -> None:
+    """The episode of 39 steps still has 39, of the plan 15."""
+    many = tsbench.load_batched("rocket_navigation", variant, count=2, distance=3.0, threads=1)
+    many.reset()
+    size, horizon = many.mdp.action_size, many.mdp.horizon
+    refused = np.full((2, size), np.nan) if refused is np.nan else refused
+    for step in range(horizon):
+        if step == 5:
+            before, state = many.steps.copy(), many.state
+            for _ in range(4):
+                with pytest.raises(TsbenchError, match=r"^(the action|action of environment 0) "):
+                    many.step(refused)
+            assert many.state is state
+            np.testing.assert_array_equal(many.steps, before)
+        hover = np.zeros((2, size))
+        hover[:, 0] = 0.5 * (step % 2) if variant is None else 0.0
+        assert many.step(hover).truncated.all() == (step == horizon - 1)
+
+
+def test_a_failed_step_needs_a_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The physics has gone on, so that the state and the physics no longer agree."""
+    many = tsbench.load_batched("rocket_navigation", count=2, threads=1)
+    first = many.reset()
+    with monkeypatch.context() as patched:
+        patched.setattr(type(many.mdp), "reward", lambda *_: np.array([0.0, np.nan]))
+        with pytest.raises(TsbenchError, match="reward of environment 1 is not finite"):
+            many.step(np.zeros((2, 2)))
+    with pytest.raises(TsbenchError, match=r"call reset\(\) first: .* their last step failed"):
+        many.step(np.zeros((2, 2)))
+    assert many.reset().tobytes() == first.tobytes()
+    many.step(np.zeros((2, 2)))
+
+
+def test_some_rows_are_stepped_and_some_begun() -> None:
+    """The others keep their states, and a row goes on as if it had been alone."""
+    many = tsbench.load_batched("rocket_obstacles", count=3, seed=[1, 2, 3], perturbed=True)
+    many.reset()
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 3, 2))
+    for action in actions[:3]:
+        transition = many.advance(action, np.array([0, 2]))
+        assert transition.reward[1] == 0.0
+        assert transition.observation.shape == (3, many.mdp.observation_size)
+    assert many.steps.tolist() == [3, 0, 3]
+    many.begin(np.array([0]))
+    for action in actions[3:]:
+        many.step(action)
+    assert many.steps.tolist() == [3, 3, 6]
+    for row, (resets, given) in enumerate([(2, actions[3:]), (1, actions[3:]), (1, actions)]):
+        one = tsbench.load("rocket_obstacles", seed=row + 1, perturbed=True)
+        for _ in range(resets):
+            one.reset()
+        for action in given:
+            last = one.step(action[row])
+        assert last.observation["observations"].tobytes() == many.observation()[row].tobytes()
+
+
+# Threads do not survive a fork.
+
+
+def in_a_child(function: Callable[[], Any]) -> str:
+    """What a forked child says to a call: the result, or the error's line."""
+    context = multiprocessing.get_context("fork")
+    answers = context.SimpleQueue()
+
+    def child() -> None:
+        try:
+            answers.put(str(function()))
+        except TsbenchError as error:
+            answers.put(str(error))
+
+    process = context.Process(target=child)
+    process.start()
+    process.join(60.0)
+    hangs = process.is_alive()
+    if hangs:
+        process.kill()
+        process.join()
+    return "hangs" if hangs else answers.get()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_is_refused() -> None:
+    """Its own process can use the environment as before."""
+    many = tsbench.load_batched("laikago_trot", count=4, threads=2)
+    many.reset()
+    many.step(np.zeros((4, 12)))
+    state = many.state
+    for call in (
+        lambda: many.step(np.zeros((4, 12))),
+        many.reset,
+        lambda: many.begin(np.array([1])),
+    ):
+        assert in_a_child(call).startswith("these environments were made in another process")
+    assert many.state is state
+    many.step(np.zeros((4, 12)))
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_makes_its_own() -> None:
+    """Also while its parent has one."""
+    many = tsbench.load_batched("rocket_navigation", count=3, threads=2)
+    expected = many.reset()
+
+    def own() -> Any:
+        batch = tsbench.load_batched("rocket_navigation", count=3, threads=2)
+        batch.reset()
+        return batch.step(np.zeros((3, 2))).reward.sum()
+
+    assert in_a_child(own) == str(many.step(np.zeros((3, 2))).reward.sum())
+    assert many.reset().tobytes() == expected.tobytes()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_single_environment_survives_a_fork() -> None:
+    """It has no threads."""
+    single = tsbench.load("laikago_trot")
+    single.reset()
+    found = in_a_child(lambda: single.step(np.zeros(12)).reward)
+    assert found == str(single.step(np.zeros(12)).reward)

@@ -17,7 +17,14 @@ from PIL import Image
 
 from tsbench.core.errors import TsbenchError
 from tsbench.viewer import film
-from tsbench.viewer.show import PLAN_COLOUR, PUSH_COLOUR, Actor, Show
+from tsbench.viewer.show import (
+    EXECUTED_COLOUR,
+    GHOST_OPACITY,
+    PLAN_COLOUR,
+    PUSH_COLOUR,
+    Actor,
+    Show,
+)
 
 
 def near(picture: NDArray[np.int64], colour: tuple[float, float, float]) -> int:
@@ -66,6 +73,98 @@ def test_a_video_is_as_long_as_the_show(make_run: Callable[..., Path], tmp_path:
     _, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
     assert 3.0 < seconds < 5.0
     assert [file.name for file in tmp_path.iterdir() if file.is_file()] == ["fall.mp4"]
+
+
+BALL = """<mujoco><worldbody><geom type="plane" size="9 9 1" rgba="1 1 1 1"/>
+  <body name="ball"><freejoint/><geom size=".4" rgba="0 0 0 1"/>{more}</body></worldbody>
+</mujoco>"""
+
+
+def pictures_of(more: str = "") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A black ball behind a ghost of itself, and the same without the ghost."""
+    model = mujoco.MjModel.from_xml_string(BALL.format(more=more))
+    executed, ghost = np.zeros((2, 7)), np.zeros((2, 7))
+    executed[:, 2:4], ghost[:, 2:4] = (0.4, 1.0), (0.4, 1.0)
+    executed[1, 0] = 0.1
+    ghost[:, 1] = -0.9  # towards the camera
+    actors = [
+        Actor("executed", executed, 0.1, EXECUTED_COLOUR, ""),
+        Actor("plan", ghost, 0.1, PLAN_COLOUR, "", ghost=True),
+    ]
+    found = []
+    with film.Camera(Show(model, actors, ""), (200, 200)) as camera:
+        for cast in (actors, actors[:1]):
+            shot = film.Shot(cast, np.array([0.0, 0.0, 0.4]), 6.0, mujoco.MjrRect(0, 0, 200, 200))
+            found.append(camera._take([shot], 0.0).astype(float))
+    return found[0], found[1]
+
+
+def test_a_ghost_can_be_seen_through() -> None:
+    """The contrast between the ball and the ground behind a ghost is 1 - GHOST_OPACITY of what it
+    is without the ghost, at every point."""
+    seen, alone = pictures_of()
+    ghost = np.abs(seen - alone).max(axis=-1) > 8
+    ball = alone.max(axis=-1) < 30
+    assert (ghost & ball).sum() > 50
+    assert (ghost & ~ball).sum() > 50
+    tint = (seen - (1.0 - GHOST_OPACITY) * alone)[ghost] / GHOST_OPACITY
+    assert tint.min() > -3.0
+    assert tint.max() < 258.0  # a colour: the ghost's own
+    through = seen[ghost & ~ball].mean(axis=0) - seen[ghost & ball].mean(axis=0)
+    plain = alone[ghost & ~ball].mean(axis=0) - alone[ghost & ball].mean(axis=0)
+    assert through.mean() > 0.4 * plain.mean()
+
+
+def test_the_parts_of_a_ghost_do_not_add_up() -> None:
+    one, _ = pictures_of()
+    many, _ = pictures_of('<geom size=".39" rgba="1 0 0 1"/><geom size=".38"/><geom size=".1"/>')
+    assert np.abs(one - many).mean() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("heights", "place"),
+    [((0.0, 20.0), "below"), ((0.0, -20.0), "above"), ((0.0, 0.0, 22.0, -22.0), "nowhere")],
+)
+def test_the_close_up_of_a_film_leaves_the_path_free(
+    heights: tuple[float, ...], place: str
+) -> None:
+    """A flat flight to the upper right, to the lower right, and one that passes both corners."""
+    ball = "<mujoco><worldbody><body><freejoint/><geom size='.4'/></body></worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(ball)
+    progress = np.linspace(0.0, 1.0, 60)
+    qpos = np.zeros((60, 7))
+    qpos[:, 0], qpos[:, 3] = 80.0 * np.minimum(1.0, 1.5 * progress), 1.0
+    qpos[:, 2] = np.interp(progress, np.linspace(0.0, 1.0, len(heights)), heights)
+    shown = Show(model, [Actor("executed", qpos, 0.1, EXECUTED_COLOUR, "")], "")
+    with film.Camera(shown, (480, 270)) as camera:
+        picture = camera.frame(0.0)
+    white = np.all(picture == 255, axis=-1).sum(axis=1)
+    rows = np.flatnonzero(white > 100)  # its frame
+    assert len(rows) == (0 if place == "nowhere" else 4)
+    if place != "nowhere":
+        assert rows.mean() > 135 if place == "below" else rows.mean() < 135
+
+
+def test_the_end_of_a_film_is_drawn_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(BALL.format(more=""))
+    qpos = np.zeros((11, 7))
+    qpos[:, 2:4] = 0.4, 1.0
+    actors = [Actor("executed", qpos, 0.05, EXECUTED_COLOUR, "", ending="solved at 0.50 s")]
+    drawn, shares = list[float](), list[float]()
+    frame = film.Camera.frame
+
+    def noted(self: film.Camera, t: float) -> film.Picture:
+        drawn.append(t)
+        return frame(self, t)
+
+    monkeypatch.setattr(film.Camera, "frame", noted)
+    film.write_video(Show(model, actors, ""), tmp_path / "film.mp4", shares.append)
+    assert drawn == pytest.approx([*np.arange(15) / 30, 0.5])
+    assert shares == pytest.approx(np.arange(1, 16) / 15)
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4"))
+    assert next(reader)["source_size"] in (film.SIZE, film.SMALL_SIZE)
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))
+    assert frames == 15 + film.FRAMES_PER_SECOND
 
 
 def test_what_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

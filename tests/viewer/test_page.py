@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import errno
-import io
-import itertools
 import json
 import math
 import os
 import re
-import shutil
-import signal
 import subprocess
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dm_control.suite
 import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
-from websockets.sync.client import ClientConnection, connect
 
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_new
@@ -39,11 +30,15 @@ from tsbench.viewer.show import (
     PUSH_COLOUR,
     SKY,
     Actor,
+    Figures,
     Show,
     landmarks,
     track,
 )
 from tsbench.viewer.subject import subject
+
+if TYPE_CHECKING:
+    from tests.viewer.conftest import Browser
 
 LAIKAGO_GOAL = (1.5, 0.0, 0.0)
 ROCKET_GOAL = (52.0, 0.0, 30.0)
@@ -91,13 +86,14 @@ def show(
     ghost: scene.Array | None = None,
     ghost_timestep: float | None = None,
     title: str = "",
-    summary: list[tuple[str, str]] | None = None,
+    summary: list[tuple[str, ...]] | None = None,
 ) -> Show:
     """A show of motions without props."""
     actors = [Actor("executed", executed, timestep, EXECUTED_COLOUR, "")]
     if ghost is not None:
         actors.append(Actor("plan", ghost, ghost_timestep or timestep, PLAN_COLOUR, "", ghost=True))
-    return Show(model=model, actors=actors, title=title, summary=summary or [])
+    tables = [Figures(("score", ""), summary)] if summary else []
+    return Show(model=model, actors=actors, title=title, tables=tables)
 
 
 def write_page(path: Path, *motions: Any, **words: Any) -> None:
@@ -305,119 +301,6 @@ def test_the_camera_looks_from_where_motion_goes_from_left_to_right() -> None:
 
 
 # The look in a browser
-
-
-WIDTH, HEIGHT = 1000, 560
-PATIENCE = 120.0  # s
-SCREENSHOTS = Path(__file__).parents[2] / "screenshots"  # kept, for people to look at
-DRAWN = """new Promise((done) => {
-  const frames = (count) => requestAnimationFrame(() => count ? frames(count - 1) : done());
-  if (document.readyState === "complete") frames(4); else addEventListener("load", () => frames(4));
-})"""
-
-
-class Browser:
-    """Headless Chromium with software WebGL, controlled by its DevTools protocol.
-
-    Chromium's flags --virtual-time-budget and --screenshot are not used: on a busy machine its
-    virtual time sometimes stops for good.
-    """
-
-    def __init__(self, connection: ClientConnection) -> None:
-        self._connection = connection
-        self._calls = itertools.count(1)
-        self._session: str | None = None
-        self._spoken: list[str] = []
-
-    def call(self, method: str, **parameters: Any) -> Any:
-        """Sends a command and returns its result; keeps the page's messages that arrive before."""
-        number = next(self._calls)
-        message = {"id": number, "method": method, "params": parameters}
-        if self._session:
-            message["sessionId"] = self._session
-        self._connection.send(json.dumps(message))
-        while True:
-            answer = json.loads(self._connection.recv(PATIENCE))
-            if answer.get("id") == number:
-                assert "error" not in answer, answer
-                return answer["result"]
-            if answer.get("method") in SPEECH:
-                self._spoken.append(json.dumps(answer["params"]))
-
-    @contextmanager
-    def open(self, url: str) -> Iterator[None]:
-        """Opens a page and waits until it is drawn. A console message then fails the test."""
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        session = self.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session, self._spoken = session["sessionId"], []
-        for domain in ("Page", "Runtime", "Log"):
-            self.call(f"{domain}.enable")
-        size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
-        self.call("Emulation.setDeviceMetricsOverride", **size)
-        self.call("Page.navigate", url=url)
-        self.ask(DRAWN)
-        yield
-        # Chromium itself writes this line about the screenshot.
-        unexpected = [line for line in self._spoken if "GPU stall due to ReadPixels" not in line]
-        self._session = None
-        self.call("Target.closeTarget", targetId=target)
-        assert not unexpected
-
-    def ask(self, expression: str) -> Any:
-        """The value of an expression in the page; waits for a promise."""
-        result = self.call(
-            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
-        )
-        assert "exceptionDetails" not in result, result
-        return result["result"].get("value")
-
-    def screenshot(self, name: str) -> NDArray[np.int64]:
-        """A screenshot of the page, saved under that name, shape (rows, columns, 3)."""
-        content = base64.b64decode(self.call("Page.captureScreenshot")["data"])
-        SCREENSHOTS.mkdir(exist_ok=True)
-        (SCREENSHOTS / f"{name}.png").write_bytes(content)
-        pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), np.int64)
-        assert pixels.shape == (HEIGHT, WIDTH, 3)
-        return pixels
-
-    def picture(self, path: Path, address: str) -> NDArray[np.int64]:
-        """A screenshot of a page between its card and its bar, shape (rows, columns, 3)."""
-        with self.open(f"{path.as_uri()}#{address}"):
-            name = f"{path.stem}_{re.sub('[^a-z0-9]+', '_', address)}"
-            return self.screenshot(name)[30 : HEIGHT - 70, 330:]
-
-
-SPEECH = ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-    programs = [program for name in names if (program := shutil.which(name))]
-    if not programs:
-        pytest.fail("no Chromium on PATH: install `chromium` (Debian) or Google Chrome")
-    profile = tmp_path_factory.mktemp("chromium")
-    command = [
-        *(programs[0], "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic"),
-        *("--no-first-run", "--disable-background-networking", "--disable-component-update"),
-        *("--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-        *("--hide-scrollbars", "--force-device-scale-factor=1", f"--user-data-dir={profile}"),
-        *("--remote-debugging-port=0", "about:blank"),
-    ]
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True) as process:
-        try:
-            port = profile / "DevToolsActivePort"  # its port, then the path of its socket
-            deadline = time.monotonic() + PATIENCE
-            while not (port.exists() and port.read_text().count("\n")):
-                assert process.poll() is None, "Chromium ended at once"
-                assert time.monotonic() < deadline, "Chromium did not start"
-                time.sleep(0.1)
-            number, path = port.read_text().splitlines()
-            with connect(f"ws://127.0.0.1:{number}{path}", max_size=None, proxy=None) as connection:
-                yield Browser(connection)
-        finally:
-            os.killpg(process.pid, signal.SIGKILL)  # with all its children
 
 
 def centre(mask: NDArray[np.bool_]) -> float:

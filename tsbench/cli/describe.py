@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import re
 import sys
@@ -14,7 +13,7 @@ from rich.console import Console
 from tsbench import tasks
 from tsbench.cli.rows import show_rows
 from tsbench.cli.tables import kept_rows
-from tsbench.core.constants import SOURCES
+from tsbench.core.constants import SOURCES, described
 from tsbench.core.task import Task
 from tsbench.core.words import number
 from tsbench.evaluation import references
@@ -89,13 +88,8 @@ def _constants(task: Task[Any]) -> Iterator[tuple[str, str, str, str, str]]:
     and of the records of constants in the task's module."""
     for name, value in tasks.defaults(task.name).items():
         yield name, _value(value), "", "", f"task.constants.{name}=... changes it, for studies"
-    for record in vars(sys.modules[type(task).__module__]).values():
-        if not dataclasses.is_dataclass(record) or isinstance(record, type):
-            continue
-        for field in dataclasses.fields(record):
-            if about := field.metadata.get("meaning"):
-                unit, source = field.metadata["unit"], field.metadata["source"]
-                yield field.name, _value(getattr(record, field.name)), unit, source, about
+    for name, value, unit, source, meaning in described(sys.modules[type(task).__module__]):
+        yield name, _value(value), unit, source, meaning
 
 
 def _reached(task: Task[Any]) -> Iterator[tuple[str, str, str]]:

@@ -27,7 +27,9 @@ def findings() -> Iterator[tuple[str, str]]:
     """Subjects and what is found about each."""
     yield "tsbench", f"{plugins.own().version}, Python {platform.python_version()}, {_system()}"
     yield "packages", ", ".join(f"{name} {_version(name)}" for name in VERSIONS)
-    yield "threads", f"{len(os.sched_getaffinity(0))} of {os.cpu_count()} cores may be used"
+    cores = os.cpu_count()  # macOS knows no affinity
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else cores
+    yield "threads", f"{allowed} of {cores} cores may be used"
     yield "OpenGL", _graphics()
     yield "GPU", _gpu()
     for state, names in _extras().items():

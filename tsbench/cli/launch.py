@@ -32,12 +32,12 @@ from tsbench.core.words import command
 from tsbench.rl import processes
 from tsbench.runs import config, execute
 from tsbench.runs.directory import RunDirectory, shown
-from tsbench.runs.schema import RunConfig
+from tsbench.runs.schema import ELSEWHERE, RunConfig
 
 RUNS = Path("runs")
 LONGEST_NAME = 48  # characters of a run directory's name, without its hash
 CHECKED_JOBS = 1000  # jobs of a sweep checked before it starts; later ones when they start
-PART_OF_THE_NAME = ("task", "method", "seed", "budget", "directory", "threads", "checkpoint")
+PART_OF_THE_NAME = ("task", "method", "seed", "budget", *ELSEWHERE)
 RESUME = "resume="
 
 

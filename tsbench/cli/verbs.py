@@ -34,6 +34,7 @@ words, in Hydra's grammar:
   directory=PATH   the run directory, a new one (runs/TASK/METHOD/seedN-BUDGET)
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
+  loggers=[...]    what shows the training: tensorboard, wandb, mlflow ([tensorboard])
   device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
   deterministic=true
                    the same bits each time on a GPU, for more time
@@ -76,6 +77,7 @@ options:
 """
 
 JSON_HELP = "write what is shown to a new JSON file too"
+VECNORMALIZE = "the model's VecNormalize, saved beside the .zip; loading it runs code too"
 PICTURES = ("--video", "--strip")  # options that need OpenGL
 
 
@@ -369,6 +371,7 @@ def _evaluate(words: Sequence[str]) -> int:
         metavar="ALGORITHM",
         help="the algorithm that saved the .zip, which can run any code when it is loaded",
     )
+    parser.add_argument("--vecnormalize", type=places.path, metavar="FILE", help=VECNORMALIZE)
     options = parser.parse_args(words)
     from rich.console import Console
 
@@ -384,7 +387,7 @@ def _evaluate(words: Sequence[str]) -> int:
     from tsbench.runs.progress import progress_bar
 
     path = places.run(options.policy)
-    policy, task = _policy(path, options.task, options.trust_sb3)
+    policy, task = _policy(path, options.task, options.trust_sb3, options.vecnormalize)
     run = directory.RunDirectory(path)
     kept = run.record() if run.finished else None
     name = options.protocol or (kept.score.protocol if kept else V1.name)
@@ -450,13 +453,16 @@ def _engine(physics: str | None) -> Any:
     return Physics
 
 
-def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, Any]:
+def _policy(
+    path: Path, word: str | None, trust_sb3: str | None, vecnormalize: Path | None = None
+) -> tuple[Any, Any]:
     """A policy, and the task in which it is evaluated.
 
     Args:
         path: a run directory, a policy file or the name of a reference policy.
         word: task=NAME, or None.
         trust_sb3: the stable-baselines3 algorithm that saved the file, or None.
+        vecnormalize: the file of that model's VecNormalize, or None.
 
     Raises:
         TsbenchError: the policy does not exist, or `word` is missing or wrong.
@@ -466,8 +472,9 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
     from tsbench.runs.directory import RunDirectory
 
     name = None if word is None else _task_name(word)
-    if trust_sb3 is not None and path.suffix != ".zip":
-        raise TsbenchError(f"--trust-sb3 is for a stable-baselines3 .zip, not for {path}")
+    for flag, given in (("--trust-sb3", trust_sb3), ("--vecnormalize", vecnormalize)):
+        if given is not None and path.suffix != ".zip":
+            raise TsbenchError(f"{flag} is for a stable-baselines3 .zip, not for {path}")
     if path.is_dir():
         run = RunDirectory(path)
         policy = run.policy()
@@ -480,7 +487,8 @@ def _policy(path: Path, word: str | None, trust_sb3: str | None) -> tuple[Any, A
             raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
         raise TsbenchError(f"no run directory {path}")
     task = tasks.checked(name)
-    return references.named(path, task) or foreign.load(path, task, trust_sb3), task
+    named = references.named(path, task)
+    return named or foreign.load(path, task, trust_sb3, vecnormalize), task
 
 
 def _task_name(word: str) -> str:
@@ -529,7 +537,10 @@ def _view(words: Sequence[str]) -> None:
     options = parser.parse_args(words)
     if (options.what is None) == (options.compare is None):
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
+    from rich.console import Console
+
     from tsbench.core.files import write_new
+    from tsbench.runs.progress import progress_bar
     from tsbench.viewer import film, page, serve
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
@@ -546,7 +557,8 @@ def _view(words: Sequence[str]) -> None:
     if options.html:
         write_new(options.html, page.render(shown).encode())
     if options.video:
-        film.write_video(shown, options.video)
+        with progress_bar(Console(stderr=True), "video") as progress:
+            film.write_video(shown, options.video, progress)
     if options.strip:
         film.write_strip(shown, options.strip)
     written = [str(path) for path in (options.html, options.video, options.strip) if path]
@@ -719,35 +731,49 @@ def _bench(words: Sequence[str]) -> None:
 
 def _export(words: Sequence[str]) -> None:
     parser = _parser("export", json=False)
-    what = "an .onnx file, a stable-baselines3 .zip, or a .pt file of a state dict"
+    what = "a run or policy directory, .onnx file, stable-baselines3 .zip, or .pt file of torch"
     parser.add_argument("model", type=places.path, metavar="MODEL", help=what)
-    parser.add_argument("task", metavar="task=NAME", help="that the policy is for")
+    for_task = "that the policy is for, if it does not say so"
+    parser.add_argument("task", nargs="?", metavar="task=NAME", help=for_task)
     parser.add_argument("directory", type=places.path, metavar="DIRECTORY", help="a new one")
-    parser.add_argument("--method", required=True, metavar="NAME", help="that made the policy")
+    parser.add_argument("--method", metavar="NAME", help="that made the policy of another library")
     parser.add_argument("--trust-sb3", metavar="ALGORITHM", help="that saved the .zip; runs code")
-    normalise = "VecNormalize's statistics beside a .zip; loading them runs code too"
-    parser.add_argument("--vecnormalize", type=places.path, metavar="FILE", help=normalise)
+    parser.add_argument("--vecnormalize", type=places.path, metavar="FILE", help=VECNORMALIZE)
     parser.add_argument("--activation", metavar="NAME", help="of a .pt file's hidden layers")
     options = parser.parse_args(words)
     from tsbench import tasks
     from tsbench.core.files import check_new
-    from tsbench.evaluation import export
+    from tsbench.evaluation import deploy, export
 
-    task = tasks.make(_task_name(options.task))
     check_new(options.directory, parents=True)
-    found = export.read(
-        options.model,
-        task,
-        algorithm=options.trust_sb3,
-        vecnormalize=options.vecnormalize,
-        activation=options.activation,
-    )
-    policy, difference = export.policy_of(found, task, options.method)
-    options.directory.mkdir(parents=True)
-    policy.save(options.directory)
-    sys.stdout.write(
-        f"{options.directory}: actions differ by at most {difference:.1g} from the model's\n"
-    )
+    if options.activation is not None and options.model.suffix not in (".pt", ".pth"):
+        raise TsbenchError(f"--activation is for a .pt file of torch, not for {options.model}")
+    if options.model.is_dir():
+        if options.method is not None:
+            raise TsbenchError("--method is for a policy of another library")
+        policy, task = _policy(options.model, options.task, options.trust_sb3, options.vecnormalize)
+        differences = deploy.write(policy, task, options.directory)
+    else:
+        if options.task is None:
+            raise TsbenchError(f"task=NAME is missing; allowed: {', '.join(tasks.names())}")
+        if options.method is None:
+            raise TsbenchError("--method NAME is missing, the name of what made the policy")
+        task = tasks.make(_task_name(options.task))
+        found = export.read(
+            options.model,
+            task,
+            algorithm=options.trust_sb3,
+            vecnormalize=options.vecnormalize,
+            activation=options.activation,
+        )
+        policy, _ = export.policy_of(found, task, options.method)
+        differences = deploy.write(policy, task, options.directory, found.answer)
+    for name, difference in differences.items():
+        about = f" (opset {deploy.OPSET}, any number of rows)" if name == deploy.ONNX_FILE else ""
+        sys.stdout.write(
+            f"{options.directory / name}{about}: "
+            f"actions differ by at most {difference:.1g} from the model's\n"
+        )
 
 
 BOARD = Path("leaderboards")
@@ -963,7 +989,7 @@ VERBS = {
     "collect": Verb("keep the scores, curves and best policies of many runs as data", _collect),
     "compare": Verb("put runs beside each other: scores, learning curves, statistics", _compare),
     "figures": Verb("make the paper's figures and its table again, from runs or results", _figures),
-    "export": Verb("write a policy of another library as tsbench's own file", _export),
+    "export": Verb("write a policy for robots, or one of another library as tsbench's", _export),
     "submit": Verb("pack runs into an entry of the leaderboard", _submit),
     "verify": Verb("check whether entries of the leaderboard hold what they claim", _verify),
     "leaderboard": Verb("show the leaderboard: as tables, or as a site", _leaderboard),

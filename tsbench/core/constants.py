@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any, NamedTuple
 
 # Sources of constants, by the letters that docs/calibration.md and the task cards use.
 SOURCES = {"P": "the paper", "D": "decided here", "C": "calibrated (docs/calibration.md)"}
@@ -23,3 +25,24 @@ def constant(value: Any, unit: str, source: str, meaning: str) -> Any:
     return dataclasses.field(
         default=value, metadata={"unit": unit, "source": source, "meaning": meaning}
     )
+
+
+class Described(NamedTuple):
+    """A constant of a record, with what `constant` was told of it."""
+
+    name: str
+    value: Any
+    unit: str
+    source: str
+    meaning: str
+
+
+def described(module: ModuleType) -> Iterator[Described]:
+    """The constants of all records in a task's module."""
+    for record in vars(module).values():
+        if not dataclasses.is_dataclass(record) or isinstance(record, type):
+            continue
+        for field in dataclasses.fields(record):
+            if about := field.metadata:
+                value = getattr(record, field.name)
+                yield Described(field.name, value, about["unit"], about["source"], about["meaning"])

@@ -64,6 +64,7 @@ class Drawing:
         still: positions (n, 3) in metres -> the states of a robot at rest there; for maps of other
             rewards than `worth`.
         lines: lines of the world.
+        robot: what moves, in a word that follows "the".
     """
 
     feet: tuple[str, ...] = ()
@@ -73,3 +74,4 @@ class Drawing:
     worth: Callable[[np.ndarray], np.ndarray] | None = None
     still: Callable[[np.ndarray], State] | None = None
     lines: tuple[Lines, ...] = ()
+    robot: str = "robot"

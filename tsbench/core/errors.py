@@ -41,7 +41,7 @@ class TsbenchError(Exception):
     """A mistake that the user can correct.
 
     The message is one line in plain words, even if it quotes a long text of several lines or of
-    control characters. The command line prints it after `tsbench: ` on the error stream and exits
+    control characters. The command line prints it after `tsbench:` on the error stream and exits
     with status 2; no traceback is shown.
     """
 

@@ -60,6 +60,14 @@ def _symlog(x: Array) -> Array:
 ENCODINGS: dict[str, Callable[[Array], Array]] = {"plain": _plain, "symlog": _symlog}
 
 
+def _symexp(x: np.ndarray) -> np.ndarray:
+    return np.sign(x) * np.expm1(np.abs(x))
+
+
+# The inverses of the encodings.
+DECODINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"plain": _plain, "symlog": _symexp}
+
+
 # Applied to what the last layer returns, before it is clipped to [-1, 1].
 OUTPUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"clip": _plain, "tanh": np.tanh}
 

@@ -9,8 +9,8 @@ its name. What was written is compared with the model's own answers.
 from __future__ import annotations
 
 import importlib
-import pickle
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from tsbench.core.errors import TsbenchError, quoted
-from tsbench.core.policy import ACTIVATIONS, Policy, PolicyInfo
+from tsbench.core.policy import ACTIVATIONS, DECODINGS, Policy, PolicyInfo
 from tsbench.core.task import MDP, Task
 from tsbench.evaluation import foreign
 from tsbench.evaluation.evaluate import check_fit
@@ -29,10 +29,12 @@ from tsbench.sim.physics import Physics
 
 SAME = 1e-4  # by which actions may differ: float32 sums in another order, over some layers
 SAMPLES = 400  # random observations of the comparison, beside those of the perturbed starts
+RSL_EPSILON = 1e-2  # of EmpiricalNormalization in rsl_rl/modules/normalization.py
 
 # Names of operations in torch and ONNX.
 _ACTIVATIONS = {"ELU": "elu", "Elu": "elu", "ReLU": "relu", "Relu": "relu", "Tanh": "tanh"}
-_NOTHING = {"Identity", "Flatten", "Dropout", "Cast"}
+_NOTHING = {"Identity", "Flatten", "Dropout", "Cast", "_IdentityDeterministicOutput"}
+_ROWS = {"Sequential", "MLP", "_TorchMLPModel"}  # of torch and rsl-rl: each child after the other
 
 
 @dataclass
@@ -122,7 +124,8 @@ def read(
     """The network in a file.
 
     Args:
-        path: an ONNX file, a state dict that torch saved, or a stable-baselines3 file.
+        path: an ONNX file, a state dict that torch saved, a checkpoint of rsl-rl, or a
+            stable-baselines3 file.
         mdp: that the policy is for.
         algorithm: of stable-baselines3, which says that whoever asks trusts both files.
         vecnormalize: the statistics of stable-baselines3's VecNormalize, or None.
@@ -131,12 +134,10 @@ def read(
     Raises:
         TsbenchError: the file is damaged, or holds something that the policy file cannot express.
     """
-    if algorithm is not None or path.suffix == ".zip":
-        policy = foreign.load(path, mdp, algorithm)
+    if algorithm is not None or vecnormalize is not None or path.suffix == ".zip":
+        policy = foreign.load(path, mdp, algorithm, vecnormalize)
         assert isinstance(policy, foreign.ForeignPolicy)
-        return from_sb3(policy, vecnormalize)
-    if vecnormalize is not None:
-        raise TsbenchError("--vecnormalize belongs to a stable-baselines3 file")
+        return from_sb3(policy)
     if path.suffix == ".onnx":
         return from_onnx(path, mdp)
     if path.suffix in (".pt", ".pth"):
@@ -145,12 +146,13 @@ def read(
 
 
 def from_torch(module: Any, size: int) -> Found:
-    """A torch module made of linear layers and activations in a row.
+    """A torch module made of linear layers and activations in a row, or an actor of rsl-rl.
 
     Raises:
         TsbenchError: it holds something else.
     """
     torch = importlib.import_module("torch")  # evaluation starts without it
+    module = foreign.plain_module(module)
 
     def answer(observation: np.ndarray) -> np.ndarray:
         with torch.no_grad():
@@ -162,23 +164,16 @@ def from_torch(module: Any, size: int) -> Found:
     return found
 
 
-def from_sb3(policy: foreign.ForeignPolicy, vecnormalize: Path | None = None) -> Found:
+def from_sb3(policy: foreign.ForeignPolicy) -> Found:
     """A stable-baselines3 model, with the statistics of its VecNormalize if it had one.
 
     Raises:
         TsbenchError: the model is of another kind than an MlpPolicy.
     """
     model = policy.model
-    net, size = model.policy, policy.observation_size
-    statistics = _Statistics(None) if vecnormalize is None else _load_statistics(vecnormalize)
-
-    def answer(observation: np.ndarray) -> np.ndarray:
-        return np.stack([policy.answer(row) for row in statistics(observation)])
-
-    found = Found(size, answer)
-    if statistics.mean is not None:
-        if statistics.mean.shape != (size,):
-            raise TsbenchError(f"{vecnormalize} is of other sizes than the model")
+    net = getattr(model, "policy", model)
+    found = Found(policy.observation_size, policy)
+    if (statistics := policy.statistics) is not None:
         found.shift, found.scale, found.bound = statistics.mean, statistics.scale, statistics.bound
     extractor = type(getattr(net, "features_extractor", None) or net.actor.features_extractor)
     if extractor.__name__ != "FlattenExtractor":
@@ -199,40 +194,9 @@ def from_sb3(policy: foreign.ForeignPolicy, vecnormalize: Path | None = None) ->
     return found
 
 
-@dataclass(frozen=True)
-class _Statistics:
-    """What VecNormalize does to observations; nothing if it has no mean."""
-
-    mean: np.ndarray | None
-    scale: np.ndarray = field(default_factory=lambda: np.ones(1))
-    bound: float = np.inf
-
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        if self.mean is None:
-            return observation
-        return np.clip((observation - self.mean) / self.scale, -self.bound, self.bound)
-
-
-def _load_statistics(path: Path) -> _Statistics:
-    """
-    Raises:
-        TsbenchError: the file cannot be read, or is something else.
-    """
-    try:
-        saved = pickle.loads(foreign.read(path))  # of a file that the user said is trusted
-        if not saved.norm_obs:
-            return _Statistics(None)
-        variance = np.asarray(saved.obs_rms.var, np.float64)
-        mean = np.asarray(saved.obs_rms.mean, np.float64)
-        return _Statistics(mean, np.sqrt(variance + saved.epsilon), float(saved.clip_obs))
-    except TsbenchError:
-        raise
-    except Exception as error:  # pickle raises anything
-        raise TsbenchError(f"{path} is no VecNormalize file: {error}") from None
-
-
 def from_state_dict(path: Path, mdp: MDP[Any], activation: str | None) -> Found:
-    """The linear layers of a state dict in the order in which it has them.
+    """The linear layers of a state dict in the order in which it has them, or of the actor in a
+    checkpoint of rsl-rl with its normaliser.
 
     Raises:
         TsbenchError: the file holds other tensors, or nobody says the activation.
@@ -242,16 +206,28 @@ def from_state_dict(path: Path, mdp: MDP[Any], activation: str | None) -> Found:
             f"{path} says no activation: --activation {'|'.join(sorted(ACTIVATIONS))}"
         )
     torch = importlib.import_module("torch")
+    if _is_script(path):
+        raise TsbenchError(
+            f"{path} is TorchScript, which is code: take the checkpoint (model_N.pt) or ONNX"
+        )
     try:
-        tensors = torch.load(path, map_location="cpu", weights_only=True)
-        arrays = {str(name): tensor.numpy() for name, tensor in tensors.items()}
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        arrays = {str(name): tensor.numpy() for name, tensor in _actor(content).items()}
     except Exception as error:  # torch and zipfile raise anything
         raise TsbenchError(f"{path} holds no state dict of plain tensors: {error}") from None
+    if any(name.startswith(("rnn.", "memory_a.")) for name in arrays):
+        raise TsbenchError(f"{path} holds an actor with a memory, a policy has none")
+    found = Found(mdp.observation_size, lambda observation: _forward(found, observation))
+    statistics = {name: arrays.pop(name) for name in list(arrays) if _NORMALISER in name}
+    if statistics:
+        values = {name.rpartition(".")[2]: array.ravel() for name, array in statistics.items()}
+        if not {"_mean", "_std"} <= values.keys() or len(values["_mean"]) != found.size:
+            raise TsbenchError(f"{path} holds a normaliser of another kind or size")
+        found.shift, found.scale = values["_mean"], values["_std"] + RSL_EPSILON
     weights = {name: array for name, array in arrays.items() if name.endswith("weight")}
     biases = {name: array for name, array in arrays.items() if name.endswith("bias")}
     for name in arrays.keys() - weights.keys() - biases.keys():
         raise TsbenchError(f"{path} holds {quoted(name)}, which is no weight or bias of a layer")
-    found = Found(mdp.observation_size, lambda observation: _forward(found, observation))
     for name, weight in weights.items():
         if found.weights:
             found.activate(str(activation))
@@ -259,6 +235,37 @@ def from_state_dict(path: Path, mdp: MDP[Any], activation: str | None) -> Found:
     for name in biases:
         raise TsbenchError(f"{path} holds {quoted(name)} without its weight")
     return found
+
+
+_NORMALISER = "obs_normalizer."
+# What a checkpoint of rsl-rl holds beside the actor: the critic, and the noise of exploration.
+_NO_ACTOR = ("critic", "privileged_", "memory_c.", "distribution.", "std", "log_std")
+
+
+def _actor(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The tensors of a state dict; of a checkpoint of rsl-rl, the actor's and its normaliser's.
+
+    Releases 4 and 5 keep the actor apart. Before, critic and noise lie in the same mapping; release
+    2 keeps the normaliser beside it.
+    """
+    for key in ("actor_state_dict", "student_state_dict", "model_state_dict"):
+        if key in content:
+            beside = content.get("obs_norm_state_dict", {})
+            tensors = {f"{_NORMALISER}{name}": tensor for name, tensor in beside.items()}
+            return tensors | {
+                name: tensor
+                for name, tensor in content[key].items()
+                if not name.startswith(_NO_ACTOR)
+            }
+    return dict(content)
+
+
+def _is_script(path: Path) -> bool:
+    """Whether a file is TorchScript."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(name.endswith("/constants.pkl") for name in archive.namelist())
 
 
 def _forward(found: Found, x: np.ndarray) -> np.ndarray:
@@ -278,7 +285,7 @@ def from_onnx(path: Path, mdp: MDP[Any]) -> Found:
     """
     policy = foreign.from_onnx(path, mdp)  # also refuses files of other sizes
     onnx = foreign.extra("onnx", "onnx")
-    graph = onnx.load_from_string(foreign.read(path)).graph
+    graph = foreign.read_onnx(path)[0].graph
     values = {one.name: onnx.numpy_helper.to_array(one) for one in graph.initializer}
     for node in graph.node:
         if node.op_type == "Constant":
@@ -342,10 +349,12 @@ def _row(values: np.ndarray) -> np.ndarray:
 
 def _leaves(module: Any) -> Iterator[Any]:
     """The modules that a torch module is made of, in their order."""
-    inner, kind = list(module.children()), type(module).__name__
-    if not inner and kind != "Sequential":
+    # Not `children`, which leaves out a module that is used again, as activations may be.
+    inner, kind = list(module._modules.values()), type(module).__name__
+    row = kind in _ROWS
+    if not inner and not row:
         yield module
-    elif kind != "Sequential":
+    elif not row:
         raise TsbenchError(f"it holds a {kind}, whose order nobody knows")
     for one in inner:
         yield from _leaves(one)
@@ -357,6 +366,9 @@ def _add_modules(found: Found, modules: Iterable[Any]) -> None:
         if kind == "Linear":
             bias = None if module.bias is None else module.bias.detach().numpy()
             found.linear(module.weight.detach().numpy(), bias)
+        elif kind == "EmpiricalNormalization" and not found.weights:  # of rsl-rl
+            found.add(-_row(module._mean.numpy()))
+            found.multiply(1.0 / (_row(module._std.numpy()) + module.eps))
         elif kind == "ELU" and module.alpha != 1.0:
             raise TsbenchError(f"it has an ELU of alpha {module.alpha:g}, not 1")
         elif kind in _ACTIVATIONS:
@@ -423,11 +435,18 @@ def policy_of(found: Found, task: Task[Any], method: str) -> tuple[Policy, float
 
 def _difference(policy: Policy, found: Found, task: Task[Any]) -> float:
     """The largest difference of an action, on perturbed starts and random observations."""
+    seen = observations(policy, task)
+    expected = np.clip(found.answer(seen), -1.0, 1.0)
+    return float(np.abs(policy(seen) - expected).max())
+
+
+def observations(policy: Policy, task: Task[Any]) -> np.ndarray:
+    """Observations to compare a policy's actions on, shape (n, o): those of the perturbed starts,
+    and `SAMPLES` random ones three times as wide as the policy has seen in training."""
     starts = perturbed_starts(task, V1)
     count = len(starts.time)
     physics: Physics[Any] = Physics(task, count, threads=1)
     seen = np.asarray(task.observation(physics.place(np.arange(count), starts)))
-    draws = np.random.default_rng(0).normal(size=(SAMPLES, found.size))
-    observations = np.concatenate([seen, found.shift + 3.0 * found.scale * draws])
-    expected = np.clip(found.answer(observations), -1.0, 1.0)
-    return float(np.abs(policy(observations) - expected).max())
+    draws = np.random.default_rng(0).normal(size=(SAMPLES, task.observation_size))
+    encoded = policy.mean + 3.0 * policy.scale * draws.astype(np.float64)
+    return np.concatenate([seen, DECODINGS[policy.info.encoding](encoded)])

@@ -40,6 +40,7 @@ from tsbench.rl import processes
 from tsbench.rl.devices import torch_device
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
+from tsbench.runs import events
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.runs.progress import progress_bar
 from tsbench.runs.provenance import check_provenance, identity, write_provenance
@@ -64,6 +65,7 @@ def prepare(config: RunConfig) -> Problem:
         deterministic=config.deterministic,
     )
     torch_device(problem.device)
+    events.check(config.loggers)
     name = config.method["name"]
     methods.options(methods.find(name).Options, problem)
     known = methods.all_stages()
@@ -178,6 +180,7 @@ def _work(
         console,
         interval=config.checkpoint,
         run=hashlib.sha256(said.encode()).hexdigest(),
+        loggers=config.loggers,
     )
     with closing(workspace), signals(workspace.stop), memory_errors(), one_thread():
         workspace.note(line)

@@ -33,7 +33,7 @@ from tsbench.core.typed import typed
 from tsbench.core.words import command
 from tsbench.evaluation.score import Score
 from tsbench.runs.directory import MAX_SCORE, RunDirectory, Stage, read_metrics
-from tsbench.runs.schema import RunConfig
+from tsbench.runs.schema import ELSEWHERE, RunConfig
 
 ROWS = "runs.jsonl"
 CURVES = "curves.npz"
@@ -45,7 +45,6 @@ CONSTANTS = "task.constants."
 # Limits of the files, in bytes. The curves of a stage are 2.4 KB.
 MAX_ROWS = 2_000 * MAX_SCORE
 MAX_CURVES = 2**28
-ELSEWHERE = ("directory", "threads", "checkpoint")  # words that change no result
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from tsbench.core.method import Budget
 from tsbench.core.typed import typed
 
 SEEDS = 2**32  # numpy and torch both take 32 bits
+ELSEWHERE = ("directory", "threads", "checkpoint", "loggers")  # keys that change no result
 DEVICES = "cpu, cuda, cuda:N, auto, warp"
 DEVICE = re.compile(r"cpu|cuda(:\d{1,3})?|auto|warp")
 omegaconf = Lazy("omegaconf")
@@ -74,6 +75,7 @@ class RunConfig:
         checkpoint: seconds of training between checkpoints.
         device: "cpu", "cuda", "cuda:N", "warp" (a GPU's code on a CPU, for tests), or "auto".
         deterministic: whether a device other than the CPU has to give the same bits each time.
+        loggers: what shows the figures of the training elsewhere (`runs.events.LOGGERS`).
 
     Raises:
         TsbenchError: a value is missing, unknown or out of range.
@@ -88,12 +90,12 @@ class RunConfig:
     checkpoint: float = 30.0
     device: str = "cpu"
     deterministic: bool = False
+    loggers: tuple[str, ...] = ("tensorboard",)
 
     @property
     def identity(self) -> dict[str, Any]:
         """The part of the configuration that determines a run's results."""
-        elsewhere = ("directory", "threads", "checkpoint")
-        return {name: value for name, value in asdict(self).items() if name not in elsewhere}
+        return {name: value for name, value in asdict(self).items() if name not in ELSEWHERE}
 
     def __post_init__(self) -> None:
         if not isinstance(self.method.get("name"), str):

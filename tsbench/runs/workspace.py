@@ -6,7 +6,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ from tsbench.core.method import Monitor, Snapshot
 from tsbench.core.typed import typed
 from tsbench.core.words import duration, number
 from tsbench.runs.checkpoint import Checkpoint, Checkpoints
-from tsbench.runs.directory import CHECKPOINTS, EVENTS, LOG, MAX_METRICS, METRICS, Stage
+from tsbench.runs.directory import CHECKPOINTS, LOG, MAX_METRICS, METRICS, Stage
 from tsbench.runs.events import Events
 
 INTERVAL = 30.0  # seconds of training between checkpoints
@@ -121,7 +121,7 @@ class Finished:
 
 
 class RunWorkspace:
-    """A run directory in use: `metrics.jsonl`, TensorBoard events, `log.txt` and checkpoints.
+    """A run directory in use: `metrics.jsonl`, what loggers show, `log.txt` and checkpoints.
 
     It implements `core.method.Workspace`. Every line is written immediately. When a run is resumed,
     metrics and events are cut back to the newest checkpoint, and the iterations after it are
@@ -129,7 +129,13 @@ class RunWorkspace:
     """
 
     def __init__(
-        self, directory: Path, console: Console, *, interval: float = INTERVAL, run: str = ""
+        self,
+        directory: Path,
+        console: Console,
+        *,
+        interval: float = INTERVAL,
+        run: str = "",
+        loggers: Sequence[str] = ("tensorboard",),
     ) -> None:
         """
         Args:
@@ -137,6 +143,7 @@ class RunWorkspace:
             console: shows progress.
             interval: seconds of training between checkpoints.
             run: hash that identifies this run; checkpoints of other runs are refused.
+            loggers: what shows the metrics elsewhere (`runs.events.LOGGERS`).
 
         Raises:
             TsbenchError: the checkpoints are another run's, or the metrics are damaged or shorter
@@ -156,7 +163,7 @@ class RunWorkspace:
             self._number, self._saved = self._newest()
             self._metrics = files.enter_context(append(directory / METRICS))
             self._rewind()
-            self._events = Events(directory / EVENTS, directory / METRICS, self.note)
+            self._events = Events(directory, self.note, loggers)
             files.callback(self._events.close)
             self._files = files.pop_all()
 
@@ -233,7 +240,7 @@ class RunWorkspace:
             self.note(f"{name}: mujoco warned {count:,} times of {kind}")
 
     def record(self, stage: Stage, metrics: Mapping[str, float]) -> None:
-        """Appends an iteration's figures to `metrics.jsonl` and to the TensorBoard events."""
+        """Appends an iteration's figures to `metrics.jsonl`, and hands them to the loggers."""
         row = {"stage": stage.name, "steps": stage.steps, "seconds": round(stage.seconds, 3)}
         row |= metrics
         self._metrics.write((json.dumps(row) + "\n").encode())

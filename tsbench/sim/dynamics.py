@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from tsbench.core.arrays import Array
-from tsbench.core.errors import NotFiniteError, TsbenchError
+from tsbench.core.errors import NotFiniteError, TsbenchError, quoted
 from tsbench.core.state import Rng, S, Start, State
 from tsbench.sim.push import Push
 
@@ -77,6 +77,26 @@ def expect_shape(action: Array, shape: tuple[int, ...]) -> None:
     found = tuple(np.shape(action))
     if found != shape:
         raise TsbenchError(f"the action has shape {found}, not {shape}")
+
+
+def as_action(action: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The action as floats.
+
+    Args:
+        action: an array, or what numpy makes one of.
+        shape: that the action must have.
+
+    Raises:
+        TsbenchError: the action is not made of real numbers, or has another shape.
+    """
+    try:
+        numbers = np.asarray(action)
+    except (TypeError, ValueError, RuntimeError):  # ragged lists; tensors with a gradient
+        numbers = np.asarray(None)
+    if numbers.dtype.kind not in "fiub":
+        raise TsbenchError(f"the action must be an array of numbers, not {quoted(action)}")
+    expect_shape(numbers, shape)
+    return np.asarray(numbers, float)
 
 
 def expect_finite(

@@ -88,10 +88,10 @@ class Physics(Generic[S]):
         """Puts the simulations in `rows` where `start` says and returns their states."""
         ids = np.asarray(rows, np.int32)
         began = perf_counter()
-        self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
-        self._qpos[rows] = start.qpos
-        self._qvel[rows] = start.qvel
         with _computing():
+            self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+            self._qpos[rows] = start.qpos
+            self._qvel[rows] = start.qvel
             self.batch.forward(ids, stage=_CURRENT)
         self.seconds += perf_counter() - began
         return self._read(rows, start.time, start.memory)
@@ -172,6 +172,8 @@ def _computing() -> Iterator[None]:
     try:
         with QUIET:
             yield
-    except SimulationError as error:
+    except (SimulationError, ValueError) as error:
+        if isinstance(error, ValueError) and "mjcb_" not in str(error):
+            raise
         reason = " ".join(str(error).split())
         raise TsbenchError(f"the physics cannot go on: {reason}") from None

@@ -184,6 +184,8 @@ class Laikago(Plannable[LaikagoState]):
     # The MDP
 
     def observation(self, state: LaikagoState) -> Array:
+        """Joint angles (12) and velocities (12); position (3), orientation (4), velocity (3) and
+        angular velocity (3) of the base; clock (3); offset (2) and distance (1) of the goal."""
         xp = array_namespace(state.joint_position)
         return xp.concat(
             [
@@ -240,6 +242,7 @@ class Laikago(Plannable[LaikagoState]):
         }
 
     def reward(self, previous: LaikagoState, action: Array, state: LaikagoState) -> Array:
+        """The product of its terms (P)."""
         distance, no_slip, height, motion = self.reward_terms(previous, action, state).values()
         return distance * no_slip * height * motion
 
@@ -248,9 +251,11 @@ class Laikago(Plannable[LaikagoState]):
         return state.com[..., 2] < C.fall_height
 
     def violated(self, state: LaikagoState) -> Array:
+        """A fall."""
         return self.fallen(state)
 
     def reached(self, state: LaikagoState) -> Array:
+        """Within 10 cm of the goal, on the ground plane."""
         return self.goal_distance(state) < C.goal_tolerance
 
     def terminal(self, state: LaikagoState) -> Array:

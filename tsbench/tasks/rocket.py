@@ -156,6 +156,8 @@ class Rocket(Plannable[RocketState]):
     # The MDP
 
     def observation(self, state: RocketState) -> Array:
+        """Position (2), angle (1), velocity (2) and angular velocity (1); goal relative to the
+        rocket (2), its distance (1), and the angle between it and the rocket's nose (1)."""
         xp = array_namespace(state.position)
         return xp.concat(
             [
@@ -299,7 +301,7 @@ class Rocket(Plannable[RocketState]):
             reward: np.ndarray = self.reward(state, state.time, state)
             return reward
 
-        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth, still=still)
+        return Drawing(flames=FLAMES, bounds=(low, high), worth=worth, still=still, robot="rocket")
 
     def start(self, rng: Rng, count: int, *, perturbed: bool = False) -> Start:
         """At the origin, at rest, upright (P).

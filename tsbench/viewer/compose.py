@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tsbench.core.drawing import Lines
+from tsbench.core.drawing import Drawing, Lines
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import Roadmap
 from tsbench.viewer.framing import reach
 from tsbench.viewer.props import balance_marks, contact_marks, flames, planned_marks, push_arrows
+from tsbench.viewer.pushes import headings
 from tsbench.viewer.recording import Recording
 from tsbench.viewer.scene import Array
 from tsbench.viewer.show import (
@@ -28,6 +29,7 @@ from tsbench.viewer.show import (
     Band,
     Curve,
     Entry,
+    Figures,
     Prop,
     Rgb,
     Show,
@@ -41,7 +43,7 @@ ROADMAP_NOTE = f"straight ways that are free, the shortest {MOST_EDGES:,} at mos
 
 EXECUTED_NOTE = "the policy's motion in full physics; its path is orange"
 PLAN_NOTE = "the planned motion, without physics; translucent"
-PAIR_NOTE = "this policy's motion in full physics; its path has this colour"
+PAIR_NOTE = "its motion in full physics; the path in this colour"
 
 STAND_PLANNED = Entry("planned contact", PLAN_COLOUR, "where a foot should stand now")
 STAND = Entry("contact", EXECUTED_COLOUR, "where a foot presses on the ground now")
@@ -50,6 +52,7 @@ PRESSURE = Entry("centre of pressure", PAPER, "white dot, mean point of the grou
 PUSH = Entry("push", PUSH_COLOUR, "an external force, while it acts")
 FLAMES = Entry("flames", FLAME_COLOUR[:3], "their length shows the engine's throttle")
 GLOW = Entry("glow", (1.0, 0.75, 0.08), "reward at this place; red is a penalty")
+BORDER = Entry("border", INK, "the edge of the world, where an episode ends")
 
 
 def compose(
@@ -58,7 +61,7 @@ def compose(
     *,
     title: str,
     verdict: str = "",
-    summary: Sequence[tuple[str, str]] = (),
+    tables: Sequence[Figures] = (),
     roadmap: Roadmap | None = None,
 ) -> Show:
     """The show of one policy and the plan that it follows. Without a plan, the scheduled contacts
@@ -67,11 +70,11 @@ def compose(
     Args:
         recording: the executed motion.
         plan: the planned motion.
-        title, verdict, summary: see `Show`.
+        title, verdict, tables: see `Show`.
         roadmap: that the plan was made with.
     """
     name, guide = "executed", plan or recording
-    actors = [Actor(name, recording.qpos, recording.task.timestep, EXECUTED_COLOUR, EXECUTED_NOTE)]
+    actors = [_executed_actor(name, recording, EXECUTED_COLOUR, EXECUTED_NOTE)]
     lines = [(EXECUTED_COLOUR, recording)]
     if plan is not None:
         actors.append(_plan_actor(plan))
@@ -85,7 +88,7 @@ def compose(
         legend += [STAND, MASS, PRESSURE]
     props += flames(name, recording)
     legend += [FLAMES] if drawing.flames else []
-    legend += [GLOW] if drawing.worth else []
+    legend += _of_world(drawing)
     arrows = push_arrows(name, recording)
     legend += [PUSH] if arrows else []
     drawn = roadmap_lines(roadmap)
@@ -95,10 +98,12 @@ def compose(
         actors=actors,
         title=title,
         verdict=verdict,
-        summary=summary,
+        tables=tables,
         props=props + arrows,
         legend=legend,
         timeline=[*foot_bands(guide, recording), *_curves(lines)],
+        robot=drawing.robot,
+        headings=list(headings(recording.task).items()),
     )
 
 
@@ -116,8 +121,9 @@ def compose_plan(
         title=title,
         verdict=verdict,
         props=marks,
-        legend=[STAND_PLANNED] * bool(marks) + [GLOW] * bool(drawing.worth) + legend,
+        legend=[STAND_PLANNED] * bool(marks) + _of_world(drawing) + legend,
         timeline=[*foot_bands(plan, None), *_curves([(PLAN_COLOUR, plan)])],
+        robot=drawing.robot,
     )
 
 
@@ -134,13 +140,39 @@ def roadmap_lines(roadmap: Roadmap | None) -> list[Lines]:
     ]
 
 
+def _of_world(drawing: Drawing) -> list[Entry]:
+    """The legend's lines for the reward map and for the world's border."""
+    return [GLOW] * (drawing.worth is not None) + [BORDER] * (drawing.bounds is not None)
+
+
+def _executed_actor(
+    name: str, recording: Recording, colour: Rgb, note: str, lane: float = 0.0
+) -> Actor:
+    ending = f"{recording.ending} at {recording.duration:.2f} s"
+    step = recording.task.timestep
+    return Actor(name, recording.qpos, step, colour, note, lane=lane, ending=ending)
+
+
 def _plan_actor(plan: Recording) -> Actor:
     return Actor("plan", plan.qpos, plan.task.timestep, PLAN_COLOUR, PLAN_NOTE, ghost=True)
 
 
-def compose_pair(first: Recording, second: Recording, *, title: str, verdict: str) -> Show:
-    """The show of two policies of one task, called A and B. Robots with feet are shown side by
-    side, others at their own positions.
+def compose_pair(
+    first: Recording,
+    second: Recording,
+    names: tuple[str, str] = ("A", "B"),
+    *,
+    title: str,
+    verdict: str,
+    tables: Sequence[Figures] = (),
+) -> Show:
+    """The show of two policies of one task. Robots with feet are shown side by side, others at
+    their own positions.
+
+    Args:
+        first, second: the executed motions.
+        names: of the policies.
+        title, verdict, tables: see `Show`.
 
     Raises:
         TsbenchError: the recordings are of different tasks or constants.
@@ -156,20 +188,24 @@ def compose_pair(first: Recording, second: Recording, *, title: str, verdict: st
     actors: list[Actor] = []
     props: list[Prop] = []
     for name, recording, colour, aside in (
-        ("A", first, EXECUTED_COLOUR, 0.0),
-        ("B", second, OTHER_COLOUR, lane),
+        (names[0], first, EXECUTED_COLOUR, 0.0),
+        (names[1], second, OTHER_COLOUR, lane),
     ):
-        step = recording.task.timestep
-        actors.append(Actor(name, recording.qpos, step, colour, PAIR_NOTE, lane=aside))
+        actors.append(_executed_actor(name, recording, colour, PAIR_NOTE, aside))
         props += flames(name, recording) + push_arrows(name, recording, aside)
+    drawing, pushed = first.task.drawing(), first.forces.any() or second.forces.any()
+    legend = [FLAMES] * bool(drawing.flames) + _of_world(drawing) + [PUSH] * bool(pushed)
     return Show(
         model=stage(first, lane),
         actors=actors,
         title=title,
         verdict=verdict,
+        tables=tables,
         props=props,
-        legend=[PUSH] if first.forces.any() or second.forces.any() else [],
+        legend=legend,
         timeline=_curves([(OTHER_COLOUR, second), (EXECUTED_COLOUR, first)]),
+        robot=drawing.robot,
+        headings=list(headings(first.task).items()),
     )
 
 

@@ -6,30 +6,30 @@ import io
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_new
 from tsbench.runs.directory import read_metrics
 
+Curve = tuple[list[Any], list[Any]]  # environment steps, returns
+
 MEASURE = "episode_return"
 LARGEST = 1e15  # figures that matplotlib draws without an overflow
 MOST_STAGES = 16
 
 
-def figure(metrics: Path) -> Figure | None:
-    """The return against environment steps, one panel for each stage.
+def read_curves(metrics: Path) -> dict[str, Curve]:
+    """The return against environment steps, by stage; none if the metrics hold no returns.
 
     Args:
         metrics: a run's `metrics.jsonl`.
 
-    Returns:
-        The figure, or None if the metrics hold no returns.
-
     Raises:
         TsbenchError: the file is damaged.
     """
-    curves: dict[str, tuple[list[Any], list[Any]]] = {}
+    curves: dict[str, Curve] = {}
     for row in read_metrics(metrics):
         if MEASURE not in row:
             continue
@@ -41,15 +41,30 @@ def figure(metrics: Path) -> Figure | None:
             values.append(one)
         if len(curves) > MOST_STAGES:
             raise TsbenchError(f"damaged metrics {metrics}: more than {MOST_STAGES} stages")
+    return curves
+
+
+def draw_curve(panel: Axes, stage: str, curve: Curve) -> None:
+    """Draws a stage's curve on a panel."""
+    panel.plot(*curve)
+    panel.set_title(stage[:40], parse_math=False)
+    panel.set(xlabel="environment steps", ylabel="episode return of the stage")
+    panel.grid(alpha=0.3)
+
+
+def figure(metrics: Path) -> Figure | None:
+    """All curves of a run's `metrics.jsonl`, one panel for each stage; None without any.
+
+    Raises:
+        TsbenchError: the file is damaged.
+    """
+    curves = read_curves(metrics)
     if not curves:
         return None
     drawn = Figure(figsize=(4.5 * len(curves), 3.2), layout="constrained")
     panels = drawn.subplots(1, len(curves), squeeze=False)[0]
-    for panel, (stage, (steps, returns)) in zip(panels, curves.items(), strict=True):
-        panel.plot(steps, returns)
-        panel.set_title(stage[:40], parse_math=False)
-        panel.set(xlabel="environment steps", ylabel="episode return of the stage")
-        panel.grid(alpha=0.3)
+    for panel, curve in zip(panels, curves.items(), strict=True):
+        draw_curve(panel, *curve)
     return drawn
 
 

@@ -6,7 +6,9 @@ import contextlib
 import itertools
 import math
 import os
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -27,25 +29,33 @@ except ImportError:  # of the extra `video`
     imageio_ffmpeg = None
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
+Progress = Callable[[float], None]  # takes the share that is done
 
-WIDTH, HEIGHT = 960, 540  # pixels of a video
-INSET = 240  # pixels, side of its close-up
+SIZE, SMALL_SIZE = (960, 540), (640, 360)  # pixels of a video; the smaller one without a GPU
+INSET = 0.42  # side of its close-up over its height
+SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|swiftshader|software", re.IGNORECASE)
+QUALITY, SLOW_QUALITY = (4, 28, 16), (0, 14, 8)  # samples, slices, stacks (MuJoCo's visual)
 SMALL = 0.4  # robot size over half the picture's height; below this a close-up is drawn
 FRAMES_PER_SECOND = 30
 CELL = 300  # pixels, side of a strip's picture
 MAX_SHAPES = 10_000  # in one picture
 TRAIL_PIECES = 120  # pieces of a drawn path, at most
-PATH_WIDTH = 0.0015  # width of a path over the distance from the camera
+PATH_WIDTH = 3.0  # pixels
 FIELD_OF_VIEW = 35.0  # degrees
-TEXT = (29, 39, 51)  # red, green, blue of 255
+TEXT, GROUND = (29, 39, 51), (244, 246, 248)  # red, green, blue of 255
+EDGE = 12  # pixels between the edge of a picture and what lies over it
+SMALLEST = 8  # pixels, of text
 
 
-def write_video(show: Show, path: Path) -> None:
+def write_video(show: Show, path: Path, progress: Progress | None = None) -> None:
     """Writes an MP4 in real time at 30 frames a second; its last frame stays for a second.
+
+    Without a GPU it is smaller and its edges are not smoothed.
 
     Args:
         show: the show to draw.
         path: a new file.
+        progress: called after each frame with the share that is done, up to 1.
 
     Raises:
         TsbenchError: no OpenGL or no encoder works here, or the file exists or cannot be written.
@@ -54,14 +64,20 @@ def write_video(show: Show, path: Path) -> None:
     if imageio_ffmpeg is None:
         raise TsbenchError("videos need an encoder: pip install 'tsbench[video]' (imageio-ffmpeg)")
     temporary = path.with_name(path.name + ".part.mp4")  # ffmpeg chooses the format by the ending
-    with Camera(show, WIDTH, HEIGHT) as camera, _removed(temporary, path):
+    with Camera(show) as camera, _removed(temporary, path):
         writer = imageio_ffmpeg.write_frames(
-            str(temporary), (WIDTH, HEIGHT), fps=FRAMES_PER_SECOND, quality=7, macro_block_size=4
+            str(temporary), camera.size, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=4
         )
         with contextlib.closing(writer):
             writer.send(None)
-            for time in np.arange(0.0, camera.duration + 1.0, 1.0 / FRAMES_PER_SECOND):
-                writer.send(camera.frame(min(float(time), camera.duration)))
+            times = np.arange(0.0, camera.duration, 1.0 / FRAMES_PER_SECOND)
+            for number, time in enumerate(times):
+                writer.send(camera.frame(float(time)))
+                if progress is not None:
+                    progress((number + 1) / len(times))
+            last = camera.frame(camera.duration)
+            for _ in range(FRAMES_PER_SECOND):
+                writer.send(last)
         temporary.replace(path)
 
 
@@ -82,7 +98,7 @@ def write_strip(show: Show, path: Path, count: int = 6) -> None:
     gutter, header = 110, 34
     strip = Image.new("RGB", (gutter + count * CELL, header + len(rows) * CELL), "white")
     pen = ImageDraw.Draw(strip)
-    with Camera(show, CELL, CELL) as camera:
+    with Camera(show, (CELL, CELL)) as camera:
         for column, time in enumerate(np.linspace(0.0, camera.duration, count)):
             x = gutter + column * CELL
             pen.text((x + CELL / 2, header / 2), f"{time:.2f} s", TEXT, _font(18), anchor="mm")
@@ -106,11 +122,16 @@ class Camera:
     """Draws pictures of a show.
 
     Attributes:
+        size: width and height of a picture in pixels.
         duration: seconds of the show.
     """
 
-    def __init__(self, show: Show, width: int, height: int) -> None:
+    def __init__(self, show: Show, size: tuple[int, int] | None = None) -> None:
         """
+        Args:
+            show: the show to draw.
+            size: width and height in pixels; None for those of a video.
+
         Raises:
             TsbenchError: no OpenGL works here, or a motion does not fit the show's model.
         """
@@ -121,75 +142,104 @@ class Camera:
         self.view = framing(show.model, start, self.tracks, show.landmarks)
         self._base = scene.moving_bodies(show.model)[0]
         self._data = mujoco.MjData(show.model)
-        show.model.vis.global_.fovy = FIELD_OF_VIEW
-        show.model.vis.global_.offwidth = max(width, INSET)
-        show.model.vis.global_.offheight = max(height, INSET)
-        self._large, self._small = _renderers(show.model, ((width, height), (INSET, INSET)))
+        self._canvas = Canvas(show.model, size)
+        self.size = self._canvas.size
 
     def __enter__(self) -> Camera:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._large.close()
-        self._small.close()
+        self._canvas.close()
 
     def frame(self, time: float) -> Picture:
         """The whole scene at a time in seconds, (H, W, 3), with a close-up of a small robot."""
-        width, height = self._large.width, self._large.height
+        width, height = self.size
         low, high = self.view.box
         centre = (low + high) / 2
         distance = _distance(self.view, centre, width / height)
         everybody = self.show.actors
-        picture = Image.fromarray(self._take(self._large, everybody, time, centre, distance))
+        whole = mujoco.MjrRect(0, 0, width, height)
+        shots = [Shot(everybody, centre, distance, whole)]
+        robot = self.view.size / (distance * math.tan(math.radians(FIELD_OF_VIEW / 2)))
+        box = self._corner(centre, distance) if robot < SMALL else None
+        if box is not None:
+            shots.append(self._close(everybody, everybody[0], time, box))
+        picture = Image.fromarray(self._take(shots, time))
         pen = ImageDraw.Draw(picture)
-        pen.text((16, 12), self.show.title, TEXT, _font(18))
-        for index, actor in enumerate(everybody):
-            pen.text((16, 40 + 24 * index), actor.name, _bytes(actor.colour), _font(16))
-        pen.text((16, height - 16), f"{time:.2f} s", TEXT, _font(18), anchor="ls")
-        if self.view.size / (distance * math.tan(math.radians(FIELD_OF_VIEW / 2))) < SMALL:
-            inset = self._close(self._small, everybody, everybody[0], time)
-            # The close-up covers the top where there is ground, the bottom in a flat world, whose
-            # goal may be at the top.
-            left, top = width - INSET - 12, height - INSET - 12 if self.view.flat else 12
-            picture.paste(Image.fromarray(inset), (left, top))
-            pen.rectangle((left, top, left + INSET, top + INSET), outline="white", width=2)
+        room = width - 3 * EDGE
+        if box is not None:
+            top = height - box.bottom - box.height
+            frame = (box.left, top, box.left + box.width, top + box.height)
+            pen.rectangle(frame, outline="white", width=2)
+            room -= box.width
+        large, small = height // 30, height // 34
+        _caption(pen, EDGE, EDGE, self.show.title, TEXT, large, room)
+        for index, (actor, motion) in enumerate(zip(everybody, self.tracks, strict=True)):
+            ended = actor.ending and time > motion.times[-1] - 1e-6
+            text = f"{actor.name}: {actor.ending}" if ended else actor.name
+            top = EDGE + 2 * large * (index + 1)
+            _caption(pen, EDGE, top, text, _bytes(actor.colour), small, room)
+        _caption(pen, EDGE, height - EDGE - 2 * large, f"{time:.2f} s", TEXT, large, room)
         return np.asarray(picture)
+
+    def _corner(self, target: Array, distance: float) -> mujoco.MjrRect | None:
+        """A corner on the right, for a close-up that covers neither a path nor a place. None if
+        there is no such corner."""
+        width, height = self.size
+        side = round(INSET * height)
+        forward, right, up = _axes(self.view)
+        offset = self.view.centres - target
+        focal = height / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
+        scale = focal / (distance - offset @ forward)
+        x, y = width / 2 + scale * (offset @ right), height / 2 + scale * (offset @ up)
+        reach, left = scale * self.view.radii, width - side - EDGE
+        for below in (height - side - EDGE, EDGE):
+            beside = (x + reach < left) | (y + reach < below) | (y - reach > below + side)
+            if beside.all():
+                return mujoco.MjrRect(left, below, side, side)
+        return None
 
     def portrait(self, actor: Actor, time: float) -> Picture:
         """A close-up of one actor alone at a time in seconds, (H, W, 3)."""
-        return self._close(self._large, [actor], actor, time)
+        box = mujoco.MjrRect(0, 0, *self.size)
+        return self._take([self._close([actor], actor, time, box)], time)
 
     def _close(
-        self, renderer: mujoco.Renderer, cast: Sequence[Actor], middle: Actor, time: float
-    ) -> Picture:
+        self, cast: Sequence[Actor], middle: Actor, time: float, box: mujoco.MjrRect
+    ) -> Shot:
         motion = self.tracks[self.show.actors.index(middle)]
         target = motion.positions[_index(motion.times, time), self._base]
         distance = 1.3 * self.view.size / math.sin(math.radians(FIELD_OF_VIEW / 2))
-        return self._take(renderer, cast, time, target, distance)
+        return Shot(cast, target, distance, box)
 
-    def _take(
-        self,
-        renderer: mujoco.Renderer,
-        cast: Sequence[Actor],
-        time: float,
-        target: Array,
-        distance: float,
-    ) -> Picture:
+    def _take(self, shots: Sequence[Shot], time: float) -> Picture:
+        """The picture with all shots. Ghosts beside other actors are blended into it as a whole, so
+        that no part of one hides another."""
+        kinds = {actor.ghost for shot in shots for actor in shot.cast}
+        pictures = []
+        for ghosts in (False, True) if len(kinds) > 1 else (True,):
+            for shot in shots:
+                self._draw(shot, time, ghosts=ghosts)
+            pictures.append(self._canvas.read())
+        blended = (1.0 - GHOST_OPACITY) * pictures[0] + GHOST_OPACITY * pictures[-1]
+        return blended.round().astype(np.uint8)
+
+    def _draw(self, shot: Shot, time: float, *, ghosts: bool) -> None:
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.lookat[:], camera.distance = target, distance
+        camera.lookat[:], camera.distance = shot.target, shot.distance
         x, y, z = np.asarray(self.view.direction) / np.linalg.norm(self.view.direction)
         camera.azimuth = math.degrees(math.atan2(-y, -x))
         camera.elevation = -math.degrees(math.asin(z))
         option = mujoco.MjvOption()
         option.geomgroup[scene.VISIBLE_GROUPS :] = 0
         option.sitegroup[scene.VISIBLE_GROUPS :] = 0
-        model, data, world = self.show.model, self._data, renderer.scene
+        model, data, world = self.show.model, self._data, self._canvas.world
         static, moving = mujoco.mjtCatBit.mjCAT_STATIC, mujoco.mjtCatBit.mjCAT_DYNAMIC
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
         mujoco.mjv_updateScene(model, data, option, None, camera, static, world)
-        for actor in cast:
+        for actor in shot.cast:
             motion = self.tracks[self.show.actors.index(actor)]
             index = _index(motion.times, time)
             data.qpos[:] = np.asarray(actor.qpos, float)[
@@ -197,37 +247,93 @@ class Camera:
             ]
             mujoco.mj_kinematics(model, data)
             first = world.ngeom
-            mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), moving, world)
+            if ghosts or not actor.ghost:
+                mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), moving, world)
             for geom in world.geoms[first : world.ngeom]:
                 geom.pos[1] += actor.lane
                 if actor.ghost:
                     _tint(geom, actor.colour)
             path = motion.positions[:, self._base]
-            _add_path(world, path if actor.ghost else path[: index + 1], actor.colour, distance)
+            _add_path(world, path if actor.ghost else path[: index + 1], actor.colour)
             for prop in self.show.props:
                 if prop.actor == actor.name:
                     _add_prop(world, prop, time)
-        return np.array(renderer.render())
+        self._canvas.draw(shot.box)
 
 
-def _renderers(
-    model: mujoco.MjModel, sizes: Sequence[tuple[int, int]]
-) -> Iterator[mujoco.Renderer]:
-    """Renderers for pictures of the given widths and heights in pixels. They draw no shadows, which
-    would take most of the time without a graphics card.
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A view of some actors in a part of a picture.
 
-    Raises:
-        TsbenchError: no OpenGL works here.
+    Attributes:
+        cast: the actors.
+        target: the point in the middle; world frame, metres, shape (3,).
+        distance: metres from the target to the camera.
+        box: the part of the picture in pixels, from its lower left corner.
     """
-    for width, height in sizes:
+
+    cast: Sequence[Actor]
+    target: Array
+    distance: float
+    box: mujoco.MjrRect
+
+
+class Canvas:
+    """MuJoCo's renderer without a window. It draws no shadows, which would take most of the time
+    without a GPU.
+
+    Attributes:
+        size: width and height in pixels.
+        world: the shapes to draw.
+    """
+
+    def __init__(self, model: mujoco.MjModel, size: tuple[int, int] | None) -> None:
+        """
+        Args:
+            model: compiled model, whose visual settings are changed.
+            size: width and height in pixels; None for those of a video, which is smaller and
+                plainer without a GPU.
+
+        Raises:
+            TsbenchError: no OpenGL works here.
+        """
         try:
-            renderer = mujoco.Renderer(model, height, width, max_geom=MAX_SHAPES)
+            self._context = mujoco.GLContext(*SIZE)
+            self._context.make_current()
+            # Each OpenGL library loads its functions when its context is first made.
+            from OpenGL import GL
+
+            slow = size is None and SOFTWARE.search(GL.glGetString(GL.GL_RENDERER).decode())
+            self.size = size or (SMALL_SIZE if slow else SIZE)
+            look, quality = model.vis.global_, model.vis.quality
+            look.fovy, (look.offwidth, look.offheight) = FIELD_OF_VIEW, self.size
+            quality.offsamples, quality.numslices, quality.numstacks = (
+                SLOW_QUALITY if slow else QUALITY
+            )
+            self._drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except Exception as error:  # each OpenGL library raises its own errors
             chosen = os.environ.get("MUJOCO_GL", "the default")
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise TsbenchError(f"OpenGL ({chosen}) draws no pictures here: {reason}") from error
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
-        yield renderer
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._drawn)
+        self.world = mujoco.MjvScene(model, MAX_SHAPES)
+        self.world.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+
+    def draw(self, box: mujoco.MjrRect) -> None:
+        """Draws the world into a part of the picture."""
+        mujoco.mjr_render(box, self.world, self._drawn)
+
+    def read(self) -> Picture:
+        """The picture, shape (H, W, 3)."""
+        width, height = self.size
+        pixels = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, mujoco.MjrRect(0, 0, width, height), self._drawn)
+        return pixels[::-1]
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self._drawn.free()
+        self._context.free()
 
 
 def _index(times: Array, time: float) -> int:
@@ -237,8 +343,7 @@ def _index(times: Array, time: float) -> int:
 
 def _tint(geom: mujoco.MjvGeom, colour: Rgb) -> None:
     geom.matid = -1
-    geom.rgba[:] = (*colour, GHOST_OPACITY)
-    geom.transparent = 1
+    geom.rgba[:] = (*colour, 1.0)
 
 
 def _next(world: mujoco.MjvScene) -> mujoco.MjvGeom:
@@ -253,15 +358,15 @@ def _next(world: mujoco.MjvScene) -> mujoco.MjvGeom:
     return world.geoms[world.ngeom - 1]
 
 
-def _add_path(world: mujoco.MjvScene, path: Array, colour: Rgb, distance: float) -> None:
+def _add_path(world: mujoco.MjvScene, path: Array, colour: Rgb) -> None:
     points = path[np.unique(np.linspace(0, len(path) - 1, TRAIL_PIECES).astype(int))]
     for begin, end in itertools.pairwise(points):
         geom = _next(world)
-        shape, none = mujoco.mjtGeom.mjGEOM_CAPSULE, np.zeros(3)
+        shape, none = mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3)
         mujoco.mjv_initGeom(
             geom, shape, none, none, np.eye(3).ravel(), np.array([*colour, 1.0], np.float32)
         )
-        mujoco.mjv_connector(geom, shape, PATH_WIDTH * distance, begin, end)
+        mujoco.mjv_connector(geom, shape, PATH_WIDTH, begin, end)
 
 
 def _add_prop(world: mujoco.MjvScene, prop: Prop, time: float) -> None:
@@ -283,16 +388,38 @@ def _add_prop(world: mujoco.MjvScene, prop: Prop, time: float) -> None:
 def _distance(view: Framing, target: Array, ratio: float) -> float:
     """The camera's distance in metres from the target at which the whole show fits into a picture
     with `ratio` of width to height."""
-    forward = np.asarray(view.direction) / np.linalg.norm(view.direction)
-    right = np.cross([0.0, 0.0, 1.0], forward)
-    right /= np.linalg.norm(right)
-    up = np.cross(forward, right)
+    forward, right, up = _axes(view)
     offset, tall = view.centres - target, 0.9 * math.tan(math.radians(FIELD_OF_VIEW / 2))
     needed = np.maximum(
         (np.abs(offset @ right) + view.radii) / (tall * ratio),
         (np.abs(offset @ up) + view.radii) / tall,
     )
     return float(np.max(offset @ forward + needed))
+
+
+def _axes(view: Framing) -> tuple[Array, Array, Array]:
+    """Unit vectors towards the camera, to the right and up in the picture, each of shape (3,)."""
+    forward = np.asarray(view.direction) / np.linalg.norm(view.direction)
+    right = np.cross([0.0, 0.0, 1.0], forward)
+    right /= np.linalg.norm(right)
+    return forward, right, np.cross(forward, right)
+
+
+def _caption(
+    pen: ImageDraw.ImageDraw,
+    left: int,
+    top: int,
+    text: str,
+    colour: tuple[int, int, int],
+    size: int,
+    room: int,
+) -> None:
+    """Writes a line on a light ground, smaller if it would be wider than `room`; in pixels."""
+    while size > SMALLEST and pen.textlength(text, _font(size)) > room:
+        size -= 1
+    x0, y0, x1, y1 = pen.textbbox((left, top), text, _font(size))
+    pen.rounded_rectangle((x0 - 5, y0 - 3, x1 + 5, y1 + 3), 4, fill=GROUND)
+    pen.text((left, top), text, colour, _font(size))
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

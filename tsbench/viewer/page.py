@@ -40,6 +40,7 @@ from tsbench.viewer.show import (
     Band,
     Curve,
     Entry,
+    Figures,
     Prop,
     Show,
     Track,
@@ -63,6 +64,7 @@ TRAIL_RADIUS = 0.004  # radius of the tube over the size of the robot
 EXECUTED_WIDTH, PLAN_WIDTH = 0.0015, 0.0011
 GRID_LINES = 5  # lines across the picture, at least
 IDENTIFIER = re.compile(rb"[0-9a-f]{8}-[0-9a-f]{4}-1[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}")
+UNBROKEN = 32  # characters of a table's row; a cell with its share of them stays on one line
 STILL = 1e-6  # m or quaternion units; a node that moves less is not animated
 JUMP = 1e-4  # s, the time of a jump from one scale to the next
 
@@ -246,9 +248,19 @@ def embedded(data: Any) -> str:
     return json.dumps(data).replace("<", "\\u003c")
 
 
-def _rows(summary: Sequence[tuple[str, str]]) -> Iterator[str]:
-    for label, value in summary:
-        yield f"<tr><td>{html.escape(label)}</td><td>{html.escape(value)}</td></tr>"
+def _table(table: Figures) -> str:
+    def line(kind: str, cells: Sequence[str]) -> str:
+        most = UNBROKEN // len(cells)
+        whole = (cell.replace(" ", "\u00a0") if len(cell) <= most else cell for cell in cells)
+        inside = "".join(f"<{kind}>{html.escape(cell)}</{kind}>" for cell in whole)
+        return f"<tr>{inside}</tr>"
+
+    return f"<table>{line('th', table.heads)}{''.join(line('td', r) for r in table.rows)}</table>"
+
+
+def _headings(show: Show) -> Iterator[str]:
+    for value, words in show.headings:
+        yield f'<option value="{html.escape(value)}">{html.escape(words)}</option>'
 
 
 def _set_stage(root: Visualizer, model: mujoco.MjModel, view: Framing) -> None:
@@ -288,6 +300,7 @@ def _send_actor(
         "node": f"meshcat/{own}",
         "base": f"meshcat/{own}/{scene.node(model, bodies[0])}",
         "ghost": actor.ghost,
+        "end": actor.ending and {"time": float(motion.times[-1]), "text": actor.ending},
         "rise": -view.below if actor.ghost else view.above,
         "trail": {
             "node": f"meshcat/path/{own}/<object>",
@@ -386,7 +399,10 @@ def render(show: Show, *, served: bool = False) -> str:
         {
             "title": html.escape(show.title),
             "verdict": html.escape(show.verdict),
-            "summary": "".join(_rows(show.summary)),
+            "tables": "".join(map(_table, show.tables)),
+            "alternative": html.escape(f"{show.title} in 3-D. {show.verdict}"),
+            "headings": "".join(_headings(show)),
+            "robot": html.escape(show.robot),
             "legend": "".join(_legend(show)),
             "licences": "".join(map(_viewer_file, LICENCES)),
             "meshcat": _viewer_file("dist/main.min.js"),

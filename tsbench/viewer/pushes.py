@@ -13,6 +13,9 @@ from tsbench.core.task import Plant
 from tsbench.sim.push import Push, direction
 
 DURATION = 0.1  # s, of every push, as in the protocol
+HEADINGS = {
+    "+x": "ahead", "-x": "back", "+y": "left", "-y": "right", "+z": "up", "-z": "down"
+}  # fmt: skip
 _NUMBER = r"\d{1,6}(?:\.\d{1,12})?"
 _GRAMMAR = re.compile(rf"({_NUMBER})N@({_NUMBER})s:([+-][xyz]|[+-]?{_NUMBER})")
 
@@ -35,13 +38,33 @@ def parse_push(text: str, plant: Plant[Any]) -> Push:
     newtons, seconds, heading = float(found[1]), float(found[2]), found[3]
     if heading[-1] not in "xyz":
         return Push(seconds, DURATION, newtons * direction(plant, math.radians(float(heading))))
-    along = np.eye(3)["xyz".index(heading[-1])]
-    if not (np.array(plant.push_plane) @ along).any():
-        axes = [
-            f"{sign}{'xyz'[int(np.argmax(axis))]}" for axis in plant.push_plane for sign in "+-"
-        ]
+    allowed = headings(plant)
+    if heading not in allowed:
         raise TsbenchError(
             f"the push '{text}' leaves the plane that the {plant.pushed} is pushed in: "
-            f"allowed are {', '.join(axes)} or an angle in degrees"
+            f"allowed are {', '.join(allowed)} or an angle in degrees"
         )
-    return Push(seconds, DURATION, newtons * along * (-1.0 if heading[0] == "-" else 1.0))
+    return Push(seconds, DURATION, newtons * _along(heading))
+
+
+def headings(plant: Plant[Any]) -> dict[str, str]:
+    """The axes of the plant's `push_plane` as `parse_push` reads them, and in words."""
+    plane = np.array(plant.push_plane)
+    return {axis: words for axis, words in HEADINGS.items() if (plane @ _along(axis)).any()}
+
+
+def _along(heading: str) -> np.ndarray:
+    """The unit vector, shape (3,), of an axis such as "-x"."""
+    along: np.ndarray = np.eye(3)["xyz".index(heading[1])]
+    return -along if heading[0] == "-" else along
+
+
+def push_in_words(push: Push, plant: Plant[Any]) -> str:
+    """A push that `parse_push` has read, such as "100 N left (+y) at 0.5 s"."""
+    first, second = np.array(plant.push_plane) @ push.force
+    angle = math.degrees(math.atan2(second, first))
+    towards = f"at {angle:.3g} degrees"
+    for axis, words in headings(plant).items():
+        if np.array_equal(np.sign(push.force), _along(axis)):
+            towards = f"{words} ({axis})"
+    return f"{np.linalg.norm(push.force):.4g} N {towards} at {float(np.min(push.time)):g} s"

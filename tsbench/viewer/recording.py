@@ -15,7 +15,7 @@ from tsbench.core.policy import Policy
 from tsbench.core.state import Readings, State
 from tsbench.core.task import Task, plannable
 from tsbench.evaluation.evaluate import check_fit
-from tsbench.evaluation.oracle import outcome
+from tsbench.evaluation.oracle import Outcome, outcome
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.model import sensor_slices
 from tsbench.sim.physics import Physics
@@ -74,11 +74,24 @@ class Recording:
         return {**terms, "reward": self.task.reward(before, self.actions, after)}
 
     @cached_property
+    def outcome(self) -> Outcome:
+        """The return and the measures of the motion, those that need actions only where something
+        acted."""
+        return outcome(self.task, self.states, None if self.solved is None else self.actions)
+
+    @property
     def measures(self) -> dict[str, float | None]:
-        """`Task.measures` of the motion, those that need actions only where something acted."""
-        return outcome(
-            self.task, self.states, None if self.solved is None else self.actions
-        ).measures
+        """`Task.measures` of the motion."""
+        return self.outcome.measures
+
+    @property
+    def ending(self) -> str:
+        """Why the episode ended, in words."""
+        if self.solved:
+            return "solved"
+        if len(self.actions) < self.task.horizon:
+            return self.task.mishap if self.violated else "ended early, unsolved"
+        return f"{self.task.mishap if self.violated else 'unsolved'}, time is up"
 
     @cached_property
     def scheduled(self) -> NDArray[np.bool_] | None:

@@ -21,11 +21,13 @@ from tsbench.evaluation.words import FIGURES, claim_force, counts, episode_rows,
 from tsbench.runs.directory import RunDirectory
 from tsbench.viewer import charts, curves, page
 from tsbench.viewer.compose import foot_bands
+from tsbench.viewer.pushes import headings
 from tsbench.viewer.recording import Recording, record_episode
 from tsbench.viewer.show import EXECUTED_COLOUR, PLAN_COLOUR
 from tsbench.viewer.subject import Subject, executed_in_words, planned_in_words, run_subject
 
 Table = Sequence[Sequence[str]]  # rows of cells, the first one the header
+NOTE = "\n"  # in a cell, before the note that stands below the text
 LEADING = 2  # number of measures that the sentences on the score give
 
 
@@ -142,6 +144,8 @@ def _sections(
 ) -> Iterator[str]:
     assert subject.score is not None
     duration = max(r.duration for r in (recording, plan) if r is not None)
+    robot = subject.task.drawing().robot
+    ahead, across = (words for axis, words in headings(subject.task).items() if axis[0] == "+")
     if recording.task.drawing().feet:
         bands = foot_bands(plan or recording, recording)
         yield _section(
@@ -152,7 +156,7 @@ def _sections(
         )
     yield _section(
         "Reward of each step",
-        "The reward of the task and its terms. Blue: the reward of the plan, as if the robot "
+        f"The reward of the task and its terms. Blue: the reward of the plan, as if the {robot} "
         "followed it exactly. Orange: the reward of the executed motion.",
         charts.rewards(recording, plan),
     )
@@ -165,11 +169,22 @@ def _sections(
         )
     yield _section(
         "Robustness",
-        f"Each push of the protocol acts on the robot's body once. Survived: the episode went on "
+        f"Each push of the protocol acts on the {robot} once. Survived: the episode went on "
         f"without {subject.task.mishap} and without straying. Recovered: the push was survived and "
         "the task solved.",
-        charts.robustness(subject.score.score.robustness.surface, subject.task.timestep),
+        charts.robustness(
+            subject.score.score.robustness.surface,
+            subject.task.timestep,
+            f"0 {ahead}, 90 {across}",
+        ),
     )
+    if run.begun:
+        kept = "" if learning else " The directory holds no metrics, so there are no curves."
+        yield _section(
+            "How it was made",
+            f"By this command, seed {subject.score.seed} of the training.{kept}",
+            f"<code>{html.escape(run.command)}</code>",
+        )
     if learning:
         yield _section(
             "How it learned",
@@ -225,20 +240,23 @@ def _score_rows(subject: Subject, plan: Recording | None) -> Table:
     score, notes = subject.score.score, {**FIGURES, **subject.task.measure_notes}
     planned = {} if plan is None else plan.measures
     beside = ("reference motion",) if planned else ()
-    rows = [
-        ("score", f"{score.perturbed.episodes} perturbed starts", "task's own start", *beside, "")
-    ]
+    rows = [("score", f"{score.perturbed.episodes} perturbed starts", "task's own start", *beside)]
     for name, value, own in episode_rows(score, subject.task):
         reference = (number(planned[name]) if name in planned else "",) if planned else ()
-        rows.append((name, value, own, *reference, notes.get(name, "")))
+        label = f"{name}{NOTE}{notes[name]}" if name in notes else name
+        rows.append((label, value, own, *reference))
     return rows
 
 
 def _table(rows: Table) -> str:
     def line(cells: Sequence[str], kind: str) -> str:
         bad = ' class="bad"' if cells[-1] == "too much" else ""
-        inside = "".join(f"<{kind}{bad}>{html.escape(cell)}</{kind}>" for cell in cells)
+        inside = "".join(f"<{kind}{bad}>{with_note(cell)}</{kind}>" for cell in cells)
         return f"<tr>{inside}</tr>"
+
+    def with_note(cell: str) -> str:
+        text, found, note = cell.partition(NOTE)
+        return html.escape(text) + (f"<small>{html.escape(note)}</small>" if found else "")
 
     head, *body = rows
     return f"<table>{line(head, 'th')}{''.join(line(cells, 'td') for cells in body)}</table>"

@@ -51,6 +51,7 @@ class Actor:
         ghost: whether the robot is translucent in `colour`, with its whole path shown from the
             beginning. Other robots have the model's colours, and their paths grow with time.
         lane: metres by which the robot is moved along y, so that two robots do not overlap.
+        ending: how its motion ends, in words; its label says so from then on.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Actor:
     note: str
     ghost: bool = False
     lane: float = 0.0
+    ending: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +138,14 @@ class Curve:
     lines: tuple[tuple[Rgb, Array, Array], ...]
 
 
+@dataclass(frozen=True)
+class Figures:
+    """A table: what its columns hold, and rows of a label and the values."""
+
+    heads: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
 @dataclass(frozen=True, eq=False)
 class Show:
     """Everything that a page or a video shows.
@@ -145,10 +155,12 @@ class Show:
         actors: the moving robots; the camera follows the first.
         title: names the run, plan or task.
         verdict: the outcome in a sentence.
-        summary: labels and values of the score.
+        tables: figures of the episodes and of the scores.
         props: marks, arrows and flames of the actors.
         legend: the legend's lines for the props; those for actors and landmarks are added.
         timeline: the rows below the picture.
+        robot: what moves, in a word that follows "the".
+        headings: the directions in which it can be pushed, as `parse_push` reads them, in words.
         landmarks: goal and obstacles of the model.
     """
 
@@ -156,10 +168,12 @@ class Show:
     actors: Sequence[Actor]
     title: str
     verdict: str = ""
-    summary: Sequence[tuple[str, str]] = ()
+    tables: Sequence[Figures] = ()
     props: Sequence[Prop] = ()
     legend: Sequence[Entry] = ()
     timeline: Sequence[Band | Curve] = ()
+    robot: str = "robot"
+    headings: Sequence[tuple[str, str]] = ()
     landmarks: Sequence[Landmark] = field(init=False)
 
     def __post_init__(self) -> None:

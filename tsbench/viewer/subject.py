@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,14 +15,15 @@ from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import Plan, ReferenceMotion, Roadmap, read_motion
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
+from tsbench.core.words import number
 from tsbench.evaluation.words import summary
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.push import Push
 from tsbench.viewer.compose import compose, compose_pair, compose_plan
-from tsbench.viewer.pushes import parse_push
+from tsbench.viewer.pushes import parse_push, push_in_words
 from tsbench.viewer.recording import Recording, record_episode, record_motion
-from tsbench.viewer.show import Show
+from tsbench.viewer.show import Figures, Show
 
 
 @dataclass(frozen=True)
@@ -68,19 +70,32 @@ class Subject:
             assert plan is not None
             verdict = planned_in_words(plan)
             return compose_plan(plan, title=self.title, verdict=verdict, roadmap=self.roadmap)
-        recording = record_episode(self.task, self.policy, force)
-        check_pushed(force, [recording])
-        return self.show_of(recording, plan)
+        recording = record_episode(self.task, self.policy)
+        if force is None:
+            return self.show_of(recording, plan)
+        pushed = record_episode(self.task, self.policy, force)
+        check_pushed(force, [pushed])
+        words = push_in_words(force, self.task)
+        return compose(
+            pushed,
+            plan,
+            title=f"{self.title}, pushed by {words}",
+            verdict=f"A push of {words} acts on the {self.task.pushed}. "
+            f"{executed_in_words(pushed)} Without the push: {recording.ending}.",
+            tables=[episode_table({"pushed": pushed, "not pushed": recording})],
+            roadmap=self.roadmap,
+        )
 
     def show_of(self, recording: Recording, plan: Recording | None) -> Show:
         """The executed motion beside the plan."""
         sentences = [] if plan is None else [planned_in_words(plan)]
+        score = self.score and self.score.score
         return compose(
             recording,
             plan,
             title=self.title,
             verdict=" ".join([*sentences, executed_in_words(recording)]),
-            summary=summary(self.score.score, self.task) if self.score else (),
+            tables=[Figures(("score", ""), summary(score, self.task))] if score else [],
             roadmap=self.roadmap,
         )
 
@@ -154,13 +169,60 @@ def pair(runs: Sequence[str], push: str | None = None) -> Show:
     force = None if push is None else parse_push(push, subjects[0].task)
     recordings = [record_episode(s.task, cast(Policy, s.policy), force) for s in subjects]
     check_pushed(force, recordings)
-    verdict = " ".join(
-        f"{name} is {one.title}. {executed_in_words(recording)}"
-        for name, one, recording in zip("AB", subjects, recordings, strict=True)
-    )
-    title = f"{subjects[0].task.name}: two policies"
+    first, second = (f"{a}: {name}" for a, name in zip("AB", names(subjects, runs), strict=True))
+    title, verdict = f"{subjects[0].task.name}: {first}, {second}", ""
+    if force is not None:
+        words = push_in_words(force, subjects[0].task)
+        title, verdict = f"{title}, pushed by {words}", f"Both are pushed by {words}. "
     a, b = recordings
-    return compose_pair(a, b, title=title, verdict=verdict)
+    verdict += f"A is {subjects[0].title}: {a.ending}. B is {subjects[1].title}: {b.ending}."
+    scores = [main_figures(one) for one in subjects]
+    scored = force is None and any(scores)  # a score says nothing of a pushed episode
+    tables = [episode_table({"A": a, "B": b}, measures=not scored)]
+    if scored:
+        tables.append(table_of(("score", "A", "B"), scores))
+    return compose_pair(a, b, (first, second), title=title, verdict=verdict, tables=tables)
+
+
+def main_figures(subject: Subject) -> dict[str, str]:
+    """The main figures of a run's score by label, none without a score. The rows of policies that
+    it is compared with, which are indented, are left out."""
+    rows = summary(subject.score.score, subject.task) if subject.score else []
+    return {label: value for label, value in rows if not label.startswith(" ")}
+
+
+def names(subjects: Sequence[Subject], runs: Sequence[str]) -> list[str]:
+    """What distinguishes runs: method, seed and budget, or else the parts of their paths."""
+    parts = [list(Path(run).resolve().parts) for run in runs]
+    if all(one.score for one in subjects):
+        described = [one.title.split(", ")[1:] for one in subjects]
+        if any(one != described[0] for one in described):
+            parts = described
+    columns = list(itertools.zip_longest(*parts, fillvalue=""))
+    telling = [column for column in columns if len(set(column)) > 1] or columns[-1:]
+    return [", ".join(filter(None, words)) for words in zip(*telling, strict=True)]
+
+
+def episode_table(recordings: Mapping[str, Recording], *, measures: bool = True) -> Figures:
+    """The figures of single episodes, by their name, with or without the task's measures."""
+    columns = [
+        {
+            "ends": recording.ending,
+            "after, s": f"{recording.duration:.2f}",
+            "distance to the goal, m": f"{recording.goal_distance[-1]:.2f}",
+            "reward, of the largest possible": f"{recording.outcome.normalized:.1%}",
+            **{name: number(value) for name, value in recording.measures.items() if measures},
+        }
+        for recording in recordings.values()
+    ]
+    return table_of(("this episode", *recordings), columns)
+
+
+def table_of(heads: tuple[str, ...], columns: Sequence[Mapping[str, str]]) -> Figures:
+    """A table of columns of figures by label; a dash for a figure that a column lacks."""
+    labels = dict.fromkeys(itertools.chain(*columns))
+    rows = [(label, *(column.get(label, "-") for column in columns)) for label in labels]
+    return Figures(heads, rows)
 
 
 def check_pushed(push: Push | None, recordings: Sequence[Recording]) -> None:

@@ -66,7 +66,7 @@ def _exhibit(task: Task, cast: dict[Group, tuple[Result, Recording]]) -> Exhibit
         grid = figure.subplots(len(cast), INSTANTS, squeeze=False)
         for panels, (group, (best, recording)) in zip(grid, cast.items(), strict=True):
             show = compose(recording, None, title="")
-            with Camera(show, PIXELS, PIXELS) as camera:
+            with Camera(show, (PIXELS, PIXELS)) as camera:
                 for panel, time in zip(panels, instants, strict=True):
                     panel.imshow(camera.portrait(show.actors[0], float(time)))
                     panel.set(xticks=[], yticks=[])

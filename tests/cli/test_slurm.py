@@ -1,0 +1,104 @@
+"""The array script for Slurm, with stand-ins for `sbatch` and `scontrol`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "examples" / "slurm" / "array.sh"
+WORDS = [
+    "task=rocket_navigation", "method=monolithic", "budget=smoke", "checkpoint=0", "loggers=[]",
+    "task.budgets.smoke.act=20480",
+]  # fmt: skip
+
+# Starts the tasks of an array one after the other, and interrupts the first start of each while it
+# trains: task 0 by SIGTERM to the shell, as near the time limit, task 1 by the death of its node.
+SBATCH = """
+import os, pathlib, signal, subprocess, sys, time
+
+array, script, *words = sys.argv[1:]
+options = [line.split()[1] for line in open(script) if line.startswith("#SBATCH")]
+assert "--requeue" in options and any(one.startswith("--signal=B:TERM@") for one in options)
+first, last = map(int, array.removeprefix("--array=").split("-"))
+for task in range(first, last + 1):
+    job = str(100 + task)
+    asked = pathlib.Path("requeue-" + job)
+    environment = os.environ | {
+        "SLURM_ARRAY_TASK_ID": str(task), "SLURM_JOB_ID": job, "SLURM_CPUS_PER_TASK": "1"
+    }
+    for start in range(3):
+        shell = subprocess.Popen(["bash", script, *words], env=environment, start_new_session=True)
+        if start == 0:
+            until = time.monotonic() + 300
+            while shell.poll() is None and time.monotonic() < until:
+                found = pathlib.Path("runs").glob(f"*/*/seed{task}-*/metrics.jsonl")
+                if any(path.read_bytes().count(b"\\n") > 1 for path in found):  # a checkpoint too
+                    break
+                time.sleep(0.01)
+            if task == 0:
+                shell.send_signal(signal.SIGTERM)
+            else:
+                os.killpg(shell.pid, signal.SIGKILL)
+                asked.touch()
+        print("start", task, start, shell.wait(), asked.exists(), flush=True)
+        if not asked.exists():
+            break
+        asked.unlink()
+"""
+
+
+def program(path: Path, code: str) -> None:
+    path.write_text(code)
+    path.chmod(0o755)
+
+
+def test_an_array_that_is_interrupted(tmp_path: Path) -> None:
+    """A task that is stopped or killed is started again, goes on where it was, and ends with the
+    same bits as a run that was left alone."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    program(programs / "tsbench", f'#!/bin/sh\nexec "{sys.executable}" -m tsbench "$@"\n')
+    program(programs / "scontrol", '#!/bin/sh\ntest "$1" = requeue && touch "requeue-$2"\n')
+    program(programs / "sbatch", f"#!{sys.executable}{SBATCH}")
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(sys.path), "PATH": f"{programs}:{os.environ['PATH']}",
+    }  # fmt: skip
+    done = subprocess.run(
+        ["sbatch", "--array=0-1", str(SCRIPT), "run", "-m", *WORDS, "seed=%a"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    starts = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("start")]
+    assert starts == [
+        ["0", "0", "143", "True"], ["0", "1", "0", "False"],
+        ["1", "0", "-9", "True"], ["1", "1", "0", "False"],
+    ], done.stderr  # fmt: skip
+    alone = subprocess.run(
+        ["tsbench", "run", *WORDS, "seed=1", "threads=1", "directory=alone"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert alone.returncode == 0, alone.stderr
+    for seed in (0, 1):
+        (run,) = (tmp_path / "runs/rocket_navigation/monolithic").glob(f"seed{seed}-*")
+        assert (run / "score.json").is_file()
+        assert "resumed: train goes on at" in (run / "log.txt").read_text()
+    policy = "policy.safetensors"
+    assert (run / policy).read_bytes() == (tmp_path / "alone" / policy).read_bytes()
+
+
+@pytest.mark.parametrize("status", [0, 2])
+def test_a_task_that_ends_by_itself_is_not_started_again(status: int, tmp_path: Path) -> None:
+    """Also with an error, which would come again; %a is replaced wherever it stands."""
+    program(tmp_path / "tsbench", f'#!/bin/sh\necho "$@" > words\nexit {status}\n')
+    program(tmp_path / "scontrol", "#!/bin/sh\ntouch asked\n")
+    variables = {"SLURM_ARRAY_TASK_ID": "7", "SLURM_JOB_ID": "9", "SLURM_CPUS_PER_TASK": "2"}
+    done = subprocess.run(
+        ["bash", str(SCRIPT), "run", "-m", "seed=%a", "directory=a b/%a"],
+        cwd=tmp_path, env=os.environ | variables | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
+    )  # fmt: skip
+    assert done.returncode == status
+    assert (tmp_path / "words").read_text() == "run -m seed=7 directory=a b/7 threads=2\n"
+    assert not (tmp_path / "asked").exists()
