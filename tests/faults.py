@@ -36,7 +36,8 @@ import numpy as np
 import pytest
 import torch
 
-import tsbench.cli.launch  # noqa: F401  what a run imports, before the forks
+import tsbench.cli.launch
+import tsbench.viewer.report  # noqa: F401
 from tsbench.cli import verbs
 from tsbench.rl.ppo import Learner
 from tsbench.rl.rollout import Rollout

@@ -36,7 +36,7 @@ def test_parts_of_a_score_leave_out_their_lists(invented_record: Callable[[str],
 def test_motions_and_policies_are_one_line(
     naive_plan: Callable[[str], Plan], naive_reference: Callable[[str], ReferenceMotion]
 ) -> None:
-    assert repr(naive_plan(TASK)).startswith(f"<Plan of {TASK}: times (")
+    assert repr(naive_plan(TASK)).startswith(f"<Plan of {TASK}: states (")
     assert repr(naive_reference(TASK)).startswith(f"<ReferenceMotion of {TASK}: qpos (")
     (entry,) = kept.trainings(kept.entries()["laikago_trot/twostage"])
     policy = RunDirectory(entry).policy()
@@ -69,4 +69,4 @@ def test_python_sees_the_progress(shown: bool, monkeypatch: pytest.MonkeyPatch) 
     assert score.perturbed.episodes == 10
     assert bool(shares) == shown
     assert shares == sorted(shares)
-    assert not shares or 0.2 < shares[-1] <= 1.0
+    assert not shares or 0.1 < shares[-1] <= 1.0

@@ -510,7 +510,7 @@ def test_a_run_whose_pages_fail_is_finished(
         os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as broken:
-        broken.setattr("tsbench.cli.launch.write_pages", interrupt)
+        broken.setattr("tsbench.viewer.report.write_pages", interrupt)
         assert cli.main(["run", *SHORT, "directory=one"]) == 143
     line = "tsbench: interrupted; the run is finished, its pages are not: tsbench report one\n"
     assert capsys.readouterr().err == line

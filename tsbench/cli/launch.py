@@ -33,7 +33,6 @@ from tsbench.rl import processes
 from tsbench.runs import config, execute
 from tsbench.runs.directory import RunDirectory, shown
 from tsbench.runs.schema import ELSEWHERE, RunConfig
-from tsbench.viewer.report import write_pages
 
 RUNS = Path("runs")
 LONGEST_NAME = 48  # characters of a run directory's name, without its hash
@@ -92,6 +91,8 @@ def finish(directory: Path, console: Console | None = None) -> None:
         TsbenchError: a page cannot be made. The run stays finished.
         Stopped: Ctrl-C or SIGTERM interrupted the making of the pages.
     """
+    from tsbench.viewer.report import write_pages  # takes a second to load, before a run begins
+
     finished, console = RunDirectory(directory), console or Console()
     record = finished.record()
     tables.show_run(console, record, finished.task(record.task))
