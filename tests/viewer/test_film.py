@@ -150,9 +150,14 @@ def test_the_end_of_a_film_is_drawn_once(monkeypatch: pytest.MonkeyPatch, tmp_pa
     qpos = np.zeros((11, 7))
     qpos[:, 2:4] = 0.4, 1.0
     actors = [Actor("executed", qpos, 0.05, EXECUTED_COLOUR, "", ending="solved at 0.50 s")]
-    drawn, shares = [], list[float]()
+    drawn, shares = list[float](), list[float]()
     frame = film.Camera.frame
-    monkeypatch.setattr(film.Camera, "frame", lambda self, t: drawn.append(t) or frame(self, t))
+
+    def noted(self: film.Camera, time: float) -> film.Picture:
+        drawn.append(time)
+        return frame(self, time)
+
+    monkeypatch.setattr(film.Camera, "frame", noted)
     film.write_video(Show(model, actors, ""), tmp_path / "film.mp4", shares.append)
     assert drawn == pytest.approx([*np.arange(15) / 30, 0.5])
     assert shares == pytest.approx(np.arange(1, 16) / 15)

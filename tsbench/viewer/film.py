@@ -189,8 +189,8 @@ class Camera:
         side = round(INSET * height)
         forward, right, up = _axes(self.view)
         offset = self.view.centres - target
-        scale = height / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
-        scale = scale / (distance - offset @ forward)
+        half = height / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
+        scale = half / (distance - offset @ forward)  # pixels per metre
         x, y = width / 2 + scale * (offset @ right), height / 2 + scale * (offset @ up)
         reach, left = scale * self.view.radii, width - side - EDGE
         for below in (height - side - EDGE, EDGE):
