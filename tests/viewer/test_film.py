@@ -153,9 +153,9 @@ def test_the_end_of_a_film_is_drawn_once(monkeypatch: pytest.MonkeyPatch, tmp_pa
     drawn, shares = list[float](), list[float]()
     frame = film.Camera.frame
 
-    def noted(self: film.Camera, t: float) -> film.Picture:
-        drawn.append(t)
-        return frame(self, t)
+    def noted(self: film.Camera, time: float) -> film.Picture:
+        drawn.append(time)
+        return frame(self, time)
 
     monkeypatch.setattr(film.Camera, "frame", noted)
     film.write_video(Show(model, actors, ""), tmp_path / "film.mp4", shares.append)

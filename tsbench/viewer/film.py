@@ -190,7 +190,7 @@ class Camera:
         forward, right, up = _axes(self.view)
         offset = self.view.centres - target
         focal = height / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
-        scale = focal / (distance - offset @ forward)
+        scale = focal / (distance - offset @ forward)  # pixels per metre
         x, y = width / 2 + scale * (offset @ right), height / 2 + scale * (offset @ up)
         reach, left = scale * self.view.radii, width - side - EDGE
         for below in (height - side - EDGE, EDGE):
