@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import mujoco
@@ -301,9 +302,9 @@ class Canvas:
             self._context = mujoco.GLContext(*SIZE)
             self._context.make_current()
             # Each OpenGL library loads its functions when its context is first made.
-            from OpenGL import GL
-
-            slow = size is None and SOFTWARE.search(GL.glGetString(GL.GL_RENDERER).decode())
+            opengl = import_module("OpenGL.GL")
+            renderer = opengl.glGetString(opengl.GL_RENDERER).decode()
+            slow = size is None and SOFTWARE.search(renderer)
             self.size = size or (SMALL_SIZE if slow else SIZE)
             look, quality = model.vis.global_, model.vis.quality
             look.fovy, (look.offwidth, look.offheight) = FIELD_OF_VIEW, self.size
