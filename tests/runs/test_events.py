@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from importlib import import_module
@@ -220,15 +221,25 @@ def pieces(content: bytes) -> Iterator[bytes]:
             parts = b""
 
 
+def whole(file: Path) -> list[Any]:
+    """The records of a .wandb file. W&B's own process may write the last of them, which says that
+    the run has ended, after `finish` has returned."""
+    made = import_module("wandb.proto.wandb_internal_pb2").Record.FromString
+    latest = time.monotonic() + 60.0
+    while True:
+        records = [made(data) for data in pieces(file.read_bytes())]
+        if records and records[-1].HasField("exit"):
+            return records
+        assert time.monotonic() < latest, "the run does not end"
+        time.sleep(0.05)
+
+
 def from_wandb(run: Path) -> tuple[dict[str, list[tuple[int, float]]], dict[str, Any]]:
     """The figures and the configuration of the one offline run in a run directory."""
-    records = import_module("wandb.proto.wandb_internal_pb2")
     (file,) = run.glob("wandb/offline-run-*/run-*.wandb")
     figures: dict[str, list[tuple[int, float]]] = {}
     about: dict[str, Any] = {}
-    for data in pieces(file.read_bytes()):
-        record = records.Record()
-        record.ParseFromString(data)
+    for record in whole(file):
         if record.HasField("run"):
             about |= {one.key: json.loads(one.value_json) for one in record.run.config.update}
         row = {

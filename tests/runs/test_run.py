@@ -591,9 +591,11 @@ def test_the_standard_directory() -> None:
         "runs/rocket_navigation/twostage/seed3-smoke"
     )
     words = ["++task.training.plan.hidden=[64, 64]", "method.finetune=0.2", "threads=1"]
-    name = "seed3-smoke,task.training.plan.hidden=_64_64_,method.finetune=0.2"
-    assert launch.directory(chosen, words).name == name
-    assert len(launch.directory(chosen, 20 * words).name) < 255
+    name = launch.directory(chosen, words).name
+    assert name.startswith("seed3-smoke,finetune=0.2,hidden=_64,_64_-")
+    assert launch.directory(chosen, words[::-1]).name == name
+    assert launch.directory(chosen, [words[0], "method.finetune=0.3"]).name != name
+    assert len(launch.directory(chosen, 20 * words).name) < 64
 
 
 def test_a_stage_on_a_terminal_and_elsewhere(tmp_path: Path) -> None:
