@@ -125,8 +125,9 @@ def normalised(name: str) -> str:
 def test_every_requirement_is_pinned(project: dict[str, Any]) -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {normalised(line.split("==")[0]) for line in lines if "==" in line}
-    extras = project["optional-dependencies"].values()
-    listed = [*project["dependencies"], *itertools.chain(*extras)]
+    extras = dict(project["optional-dependencies"])
+    del extras["ray"]  # it needs older packages than the pinned ones, so it has an own environment
+    listed = [*project["dependencies"], *itertools.chain(*extras.values())]
     wanted = [item for item in listed if not item.startswith("tsbench[")]  # an extra in another
     assert {normalised(re.split(r"[<>=]", item)[0]) for item in wanted} <= pinned
 
@@ -137,7 +138,8 @@ def test_pins_name_no_local_build() -> None:
 
 def made(*words: str) -> list[str]:
     """The words of the last command that `make` would run."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
+    of_make = ("MAKE", "MFLAGS", "ARGS")  # of a `make test` that runs the tests
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(of_make)}
     done = subprocess.run(
         ["make", "--dry-run", *words], cwd=ROOT, env=environment, capture_output=True, text=True
     )
