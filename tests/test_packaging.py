@@ -19,7 +19,7 @@ import pytest
 from tsbench import methods, tasks
 
 ROOT = Path(__file__).parents[1]
-MOST_BYTES = 4_000_000  # a wheel has 2.6 MB
+MOST_BYTES = 6_000_000  # a wheel has 3.5 MB, an sdist 4.4
 
 
 @pytest.fixture(scope="module")
