@@ -34,9 +34,8 @@ def test_an_entry_holds_together(entry: Path) -> None:
     check_fit(policy, task)
     assert tasks.standard(task)
     content = run.record()
-    assert (content.task, content.method) == entry.parts[-3:-1] == (
-        policy.info.task, policy.info.method,
-    )  # fmt: skip
+    assert entry.parts[-3] == content.task == policy.info.task
+    assert content.method == policy.info.method
     score = content.score
     assert content.standard
     assert score.origin.protocol == PROTOCOLS[entry.parts[-4]]
