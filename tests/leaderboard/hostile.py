@@ -445,7 +445,7 @@ EDGES: dict[str, list[Any]] = {  # of numbers, for who draws them
 }  # fmt: skip
 MANIFEST: dict[str, list[Any]] = {
     "schema": [2, "1", None, 2**70], "described/entry": ["other", "../entry", "", "A", "x" * 65],
-    "described/authors": [[], [""], ["x" * 1001], ["\x1b[31m"], ["a"] * 101, [3]],
+    "described/authors": [[], [""], ["x" * 4001], ["\x1b[31m"], ["a"] * 101, [3]],
     "described/licence": ["", "\n", 5], "described/url": ["javascript:alert(1)", "x" * 400],
     "described/hardware": ["\x07", 3], "described/tuning_trials": [-1, 2.5, 2**60],
     "described/seeds_trained": [[], [1], [0, 0], [-1], [2**40]],

@@ -63,7 +63,7 @@ LIMITS = {**NEEDED, **OPTIONAL}
 MAX_MANIFEST = 512 * 2**10  # bytes
 MAX_TRAININGS = 100
 MAX_ENTRY = 128 * 2**20  # bytes of all files together
-MAX_TEXT = 1000  # characters of a text in the manifest
+MAX_TEXT = 4000  # characters of a text in the manifest; a recipe may be a long command
 MAX_COUNT = 2**53  # steps
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.+-]{0,63}")
