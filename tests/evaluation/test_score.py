@@ -38,7 +38,7 @@ def test_motions_and_policies_are_one_line(
 ) -> None:
     assert repr(naive_plan(TASK)).startswith(f"<Plan of {TASK}: states (")
     assert repr(naive_reference(TASK)).startswith(f"<ReferenceMotion of {TASK}: qpos (")
-    (entry,) = kept.trainings(kept.entries()["laikago_trot/twostage"])
+    entry = kept.trainings(kept.entries()["laikago_trot/twostage"])[0]
     policy = RunDirectory(entry).policy()
     assert repr(policy).startswith("<Policy of twostage for laikago_trot: 43 to ")
     for one in (naive_plan(TASK), naive_reference(TASK), policy):
