@@ -73,7 +73,9 @@ def test_the_registration_keeps_what_the_object_keeps(name: str) -> None:
     assert made.render_mode == "rgb_array"
     assert made.metadata == {"render_modes": ["rgb_array"], "render_fps": round(1 / task.timestep)}
     again = gymnasium.make(EnvSpec.from_json(made.spec.to_json()))
-    assert json.loads(again.spec.to_json()) == json.loads(made.spec.to_json())  # type: ignore[union-attr]
+    assert again.spec is not None
+    assert made.spec is not None
+    assert json.loads(again.spec.to_json()) == json.loads(made.spec.to_json())
     assert again.reset(seed=3)[0].tobytes() == made.reset(seed=3)[0].tobytes()
     many = gymnasium.make_vec(identifier, num_envs=2, render_mode="rgb_array", threads=1)
     assert many.spec is not None
