@@ -427,8 +427,8 @@ def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]
     trained(Path("one").absolute(), [*words, "task.budgets.smoke.act=512"])
     assert submit("one") == 0
     assert {path.name for path in (ENTRY / "seed0").iterdir()} == {
-        "actions.npz", "config.yaml", "policy.json", "policy.safetensors", "score.json",
-        "versions.json",
+        "actions.npz", "config.yaml", "metrics.jsonl", "policy.json", "policy.safetensors",
+        "score.json", "versions.json",
     }  # fmt: skip
     run = str(ENTRY / "seed0")
     assert cli.main(["view", run, "--html", "entry.html"]) == 0
