@@ -157,6 +157,11 @@ def test_words_of_run(
         ([TASK], f"(did you mean 'tsbench run {TASK}'?)"),
         (["list", "--jsn", "x"], "(did you mean --json?)"),
         (["evaluate", "laikago_trot/twostag"], "the kept entry laikago_trot/twostage?)"),
+        (["verify", "laikago_trot/twostag"], "the kept entry laikago_trot/twostage?)"),
+        (["compare", "laikago_trt/prm"], "the kept entry laikago_trot/prm?)"),
+        (["view", "laikago_trot"], "(did you mean the kept entry laikago_trot/"),
+        (["report", "laikago_trt"], "(did you mean the kept entry laikago_trot/"),
+        (["evaluate", "one", TASK], "no policy one; without a file there are random and zero"),
         (["evaluate", "x.zip", TASK, "--trust-sb3", "ppo"], "(did you mean 'PPO'?)"),
         (["describe", "Rocket_Navigation"], "(did you mean 'rocket_navigation'?)"),
     ],
@@ -282,6 +287,24 @@ def test_missing_trainings_and_entries_are_left_as_they_are() -> None:
     assert places.run("nowhere") == Path("nowhere")
     with pytest.raises(TsbenchError, match=re.escape(f"did you mean the kept entry {name}?")):
         places.run(f"{name}x")
+
+
+def test_the_board_of_the_kept_entries_is_shown_anywhere(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """It is only read: a file is written to a board that is here or that is named."""
+    assert verbs.main(["leaderboard"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("## ")
+    for name in kept.entries():
+        task, _, entry = name.partition("/")
+        assert re.search(rf"^## {task}$(?:(?!^## ).)*^\| {entry} \|", text, re.M | re.S)
+    for words in (["leaderboard", "--readme"], ["verify", "--all", "--record"]):
+        assert verbs.main(words) == 2
+        assert "no board leaderboards: --board names its directory" in capsys.readouterr().err
+    assert verbs.main(["leaderboard", "--board", "nowhere"]) == 2
+    assert "no board nowhere" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 # Directories of runs

@@ -128,7 +128,9 @@ def test_runs_become_an_entry(finished: Path, capsys: pytest.CaptureFixture[str]
     assert manifest.files["seed3/plan.npz"].sha256 == digest
     assert [path.name for path in Path("board").iterdir()] == ["quick"]  # nothing half-made
     assert submit("one") == 2
-    assert "exists and nothing is overwritten" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "exists and nothing is overwritten" in told.err
+    assert "replayed" not in told.out + told.err  # it is refused before it is verified
 
 
 def test_an_entry_is_verified_in_full_and_the_verdict_kept(

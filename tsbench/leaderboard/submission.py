@@ -589,31 +589,49 @@ def discard(entry: Path) -> None:
     shutil.rmtree(entry.parent.parent, ignore_errors=True)
 
 
+def home(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) -> Path:
+    """The place on the board of an entry that `pack` made.
+
+    Raises:
+        TsbenchError: there is another entry in that place, or the runs lie there and are not what
+            an entry keeps of them.
+    """
+    place = board / protocol.name / entry.parent.name / entry.name
+    with os_errors(place):
+        if not _lie_in(place, entry, runs):
+            check_new(place, parents=True)
+            return place
+        check_new(place / MANIFEST)
+        for name in read_manifest(entry).files:
+            if (place / name).read_bytes() != (entry / name).read_bytes():
+                reason = "is not what an entry keeps of it: submit the run from elsewhere"
+                raise TsbenchError(f"{place / name} {reason}")
+    return place
+
+
 def place(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) -> Path:
     """Moves an entry that `pack` made to its place on the board.
 
     Runs that lie in that place already (`seedN`) stay as they are, and get the manifest.
 
     Raises:
-        TsbenchError: there is another entry in that place, or the runs there are not what an entry
-            keeps of them.
+        TsbenchError: as `home`.
     """
-    home = board / protocol.name / entry.parent.name / entry.name
-    with os_errors(home):
-        if home.is_dir() and {run.resolve() for run in runs} == {
-            (home / folder.name).resolve() for folder in entry.iterdir() if folder.is_dir()
-        }:
-            for name in Manifest.decode((entry / MANIFEST).read_bytes()).files:
-                if (home / name).read_bytes() != (entry / name).read_bytes():
-                    reason = "is not what an entry keeps of it: submit the run from elsewhere"
-                    raise TsbenchError(f"{home / name} {reason}")
-            write_new(home / MANIFEST, (entry / MANIFEST).read_bytes())
+    there = home(entry, board, protocol, runs)
+    with os_errors(there):
+        if _lie_in(there, entry, runs):
+            write_new(there / MANIFEST, (entry / MANIFEST).read_bytes())
         else:
-            check_new(home, parents=True)
-            home.parent.mkdir(parents=True, exist_ok=True)
-            entry.rename(home)
+            there.parent.mkdir(parents=True, exist_ok=True)
+            entry.rename(there)
     discard(entry)
-    return home
+    return there
+
+
+def _lie_in(place: Path, entry: Path, runs: Sequence[Path]) -> bool:
+    """Whether the runs are the directories of an entry's trainings in that place already."""
+    folders = {(place / one.name).resolve() for one in entry.iterdir() if one.is_dir()}
+    return place.is_dir() and {run.resolve() for run in runs} == folders
 
 
 def _pack_run(

@@ -308,7 +308,8 @@ def thin_metrics(path: Path) -> bytes:
     """
     stages: dict[str, list[dict[str, Any]]] = {}
     for row in read_metrics(path):
-        stage, kept = row.get("stage"), {key: row.get(key) for key in ("steps", "seconds")}
+        stage = row.get("stage")
+        kept: dict[str, Any] = {key: row.get(key) for key in ("steps", "seconds")}
         kept |= {name: row[name] for name in RETURNS if name in row}
         if len(kept) == 2:
             continue
