@@ -21,7 +21,8 @@ from tsbench import methods, tasks
 from tsbench.cli import describe, doctor, hints, places, streams, tables, usage, verbs
 from tsbench.cli.launch import directory
 from tsbench.core.errors import TsbenchError
-from tsbench.leaderboard import kept
+from tsbench.core.words import number
+from tsbench.leaderboard import kept, page
 from tsbench.runs import config
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.runs.execute import _way_on
@@ -272,6 +273,17 @@ def test_kept_entries_have_short_names() -> None:
         for word in (name, f"v1/{name}", f"{name}/{first.name}", str(entry), str(first)):
             assert places.run(word) == first, word
             assert RunDirectory(first).policy().info.task == entry.parent.name
+
+
+def test_a_score_is_compared_with_the_figures_of_the_board() -> None:
+    board = next(folder for folder in kept.FOLDERS if folder.is_dir())
+    for table in page.tables(board)[0]:
+        rows = {label.split()[1]: figures for label, *figures in
+                tables.kept_rows(tasks.make(table.task))}  # fmt: skip
+        assert rows == {
+            f"{table.task}/{row.name}": [number(row.reward.iqm), number(row.figures["success"])]
+            for row in table.rows
+        }
 
 
 def test_what_exists_here_comes_before_a_kept_entry(tmp_path: Path) -> None:
