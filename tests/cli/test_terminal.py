@@ -160,6 +160,8 @@ def test_words_of_run(
         (["evaluate", "laikago_trot/twostag"], "the kept entry laikago_trot/twostage?)"),
         (["verify", "laikago_trot/twostag"], "the kept entry laikago_trot/twostage?)"),
         (["compare", "laikago_trt/prm"], "the kept entry laikago_trot/prm?)"),
+        (["export", "laikago_trot/pr", "x"], "the kept entry laikago_trot/prm?)"),
+        (["export", "one", "x"], "no model one: there is no such file or directory"),
         (["view", "laikago_trot"], "(did you mean the kept entry laikago_trot/"),
         (["report", "laikago_trt"], "(did you mean the kept entry laikago_trot/"),
         (["evaluate", "one", TASK], "no policy one; without a file there are random and zero"),
@@ -383,6 +385,7 @@ def loaded(program: str) -> set[str]:
     [
         ("--help", {"numpy", "rich", "yaml", "mujoco", "importlib.metadata"}),
         ("list", {"torch", "hydra", "omegaconf", "mink", "scipy.interpolate", "OpenGL"}),
+        ("run task=rocket_navigatoin", {"torch", "mink", "matplotlib", "tensorboard"}),
         ("evaluate nowhere", {"torch", "hydra", "matplotlib", "mink", "OpenGL"}),
     ],
 )  # fmt: skip

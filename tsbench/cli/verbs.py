@@ -734,8 +734,8 @@ def _bench(words: Sequence[str]) -> None:
 
 def _export(words: Sequence[str]) -> None:
     parser = _parser("export", json=False)
-    what = "a run or policy directory, .onnx file, stable-baselines3 .zip, or .pt file of torch"
-    parser.add_argument("model", type=places.path, metavar="MODEL", help=what)
+    what = "a run or policy directory, TASK/ENTRY, .onnx, stable-baselines3 .zip, or .pt of torch"
+    parser.add_argument("model", type=places.run, metavar="MODEL", help=what)
     for_task = "that the policy is for, if it does not say so"
     parser.add_argument("task", nargs="?", metavar="task=NAME", help=for_task)
     parser.add_argument("directory", type=places.path, metavar="DIRECTORY", help="a new one")
@@ -749,6 +749,8 @@ def _export(words: Sequence[str]) -> None:
     from tsbench.evaluation import deploy, export
 
     check_new(options.directory, parents=True)
+    if not (options.model.exists() or options.model.is_symlink()):
+        raise TsbenchError(f"no model {options.model}: there is no such file or directory")
     if options.activation is not None and options.model.suffix not in (".pt", ".pth"):
         raise TsbenchError(f"--activation is for a .pt file of torch, not for {options.model}")
     if options.model.is_dir():
