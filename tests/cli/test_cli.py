@@ -75,6 +75,7 @@ def test_list_shows_tasks_without_a_configuration(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A new task may lack its configuration file while its author writes it."""
+    assert tasks.names()  # registers all, so that they are still there after this test
     monkeypatch.setattr(tasks, "_factories", dict(tasks._factories))
 
     @tasks.register("stroll")
@@ -160,6 +161,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", TASK, "task.training.imitat.clip=1"], "(did you mean 'imitate'?)"),
         (["run", "-m", TASK, "seed=1,-2"], "seed must lie between 0 and 4294967295, not -2"),
         (["run", TASK, "hydra/launcher=rocket"], "unknown hydra/launcher 'rocket'"),
+        (["run", TASK, "hydra/launcher=ray"], "is missing: pip install 'tsbench[ray]'"),
         (["run", TASK, "directory=/etc/passwd"], "/etc/passwd: File exists"),
         (["run", TASK, "directory=/etc/passwd/x"], "/etc/passwd/x: Not a directory"),
         (["run", TASK, "directory=/proc/none"], "/proc/none: "),

@@ -143,6 +143,9 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         f"{out}/policy.safetensors", f"{out}/policy.onnx (opset 17, any number of rows)",
         f"{out}/policy.py",
     ]  # fmt: skip
+    assert verbs.main(["export", "rocket_navigation/prm", f"{out}1"]) == 0  # a kept entry
+    assert (Path(f"{out}1") / "policy.onnx").is_file()
+    (tmp_path / "p.onnx").touch()
     for words, line in (
         ([str(run), str(out)], "exists"),
         ([str(run), f"{out}2", "--method", "mine"], "--method is for a policy of another library"),

@@ -556,7 +556,7 @@ READ_BY = {
     ),
     "resume": ("config.yaml", "versions.json"),
     "submit": ("policy.json", "policy.safetensors", "config.yaml", "score.json", "actions.npz",
-               "versions.json", "plan.npz", "reference.npz"),
+               "versions.json", "plan.npz", "reference.npz", "metrics.jsonl"),
 }  # fmt: skip
 ABSENT = {  # whose absence is no fault
     ("gone", name) for name in ("config.yaml", "actions.npz", "plan.npz", "reference.npz",
@@ -667,7 +667,8 @@ def entries(folder: Path) -> None:
 
 def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> None:
     whole = intact(folder / "whole") / "seed0"
-    (whole / "metrics.jsonl").write_text('{"stage": "plan", "steps": 1, "episode_return": 1.0}\n')
+    row = {"stage": "plan", "steps": 1, "seconds": 1.0, "episode_return": 1.0}
+    (whole / "metrics.jsonl").write_text(f"{json.dumps(row)}\n")
     found = run_cases([chosen] if chosen else [*READ_BY], only is None)
     for verb, case, change in score_cases() if only == "scores" else found:
         out = Path(tempfile.mkdtemp(dir=folder))

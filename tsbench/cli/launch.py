@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
@@ -26,13 +26,20 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from tsbench.cli import hints, tables
+from tsbench.cli.streams import loading
 from tsbench.core.errors import Stopped, TsbenchError, memory_errors
 from tsbench.core.files import write_json
+from tsbench.core.lazy import Lazy
 from tsbench.core.words import command
-from tsbench.rl import processes
-from tsbench.runs import config, execute
+from tsbench.runs import config
 from tsbench.runs.directory import RunDirectory, shown
 from tsbench.runs.schema import ELSEWHERE, RunConfig
+
+if TYPE_CHECKING:
+    from tsbench.rl import processes
+    from tsbench.runs import execute
+else:  # they load torch, so a mistake in the words is told first
+    processes, execute = Lazy("tsbench.rl.processes"), Lazy("tsbench.runs.execute")
 
 RUNS = Path("runs")
 LONGEST_NAME = 48  # characters of a run directory's name, without its hash
@@ -75,10 +82,12 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
         return
     else:
         chosen = placed(config.compose(flags.overrides), flags.overrides)
-        if processes.rank():
+        with loading():
+            first, train = not processes.rank(), execute.execute
+        if not first:
             execute.assist(chosen)
             return
-        execute.execute(chosen, _own(flags.overrides))
+        train(chosen, _own(flags.overrides))
         place = Path(chosen.directory or "")
         finish(place)
     write_json(json, shown(RunDirectory(place).record()))

@@ -214,7 +214,8 @@ def markdown(found: Sequence[Table], left_out: Sequence[str], before: str) -> st
                 number(given["survival_100N"]), "", "", "reference", "", "",
             ]  # fmt: skip
             lines.append(f"| {' | '.join(cells)} |")
-        lines += ["", f"The best plan earns {number(table.best)}."]
+        if table.best > 0.0:
+            lines += ["", f"The best plan earns {number(table.best)}."]
     if left_out:
         lines += ["", "Not shown:", "", *(f"- {as_markdown(line)}" for line in left_out)]
     return "\n".join(lines) + "\n"

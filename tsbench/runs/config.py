@@ -38,6 +38,7 @@ from tsbench.runs.schema import names as names
 
 CONFIGURATIONS = "tsbench.conf"
 VERSION_BASE = "1.3"  # the defaults of this Hydra release
+LAUNCHERS = ("joblib", "ray")  # of Hydra, which extras of the same names bring
 OPEN_MAPPINGS = ("task.training.", "task.constants.", "task.gpu.")
 
 
@@ -177,6 +178,9 @@ def one_line_errors() -> Iterator[None]:
         registry = {"task": tasks, "method": methods}.get(parts[0])
         if registry is not None and parts[2] in registry.names():
             raise TsbenchError(lacking(parts[0], parts[2])) from None
+        if parts[0] == "hydra/launcher" and parts[2] in LAUNCHERS:
+            reason = f"pip install 'tsbench[{parts[2]}]'"
+            raise TsbenchError(f"the launcher {parts[2]} is missing: {reason}") from None
         raise unknown(parts[0], parts[2], error.options, plugins.broken()) from None
     except CompactHydraException as error:
         cause = error.__cause__
