@@ -36,6 +36,8 @@ from safetensors.numpy import load, save
 
 from tsbench import cli
 from tsbench.core.errors import TsbenchError
+from tsbench.core.files import encode_json
+from tsbench.core.policy import encode_info
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import V1
 from tsbench.leaderboard import submission, verify
@@ -490,7 +492,8 @@ def altered(name: str, path: str, value: Any) -> Change:
         if name == "manifest.json":
             signed(folder, values)
         else:
-            (folder / name).write_text(json.dumps(values))
+            encode = encode_info if name.endswith("policy.json") else encode_json
+            (folder / name).write_bytes(encode(values))
 
     return change
 

@@ -21,6 +21,7 @@ from rich.console import Console
 from tsbench import tasks
 from tsbench.cli import verbs as cli
 from tsbench.core.errors import TsbenchError
+from tsbench.core.files import encode_json
 from tsbench.core.motion import Plan
 from tsbench.evaluation import protocol as protocols
 from tsbench.evaluation.evaluate import evaluate
@@ -30,6 +31,7 @@ from tsbench.leaderboard import submission, verify
 from tsbench.leaderboard.submission import Described, Manifest
 from tsbench.runs import config, execute
 from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import identity_hash
 
 BOARD = Path(__file__).parents[2] / "leaderboards"
 KEPT = sorted(path.parent for path in BOARD.glob("v1/*/*/manifest.json"))
@@ -71,10 +73,14 @@ def finished(shown: Path) -> Path:
 
 
 def seeded(run: Path, seed: int) -> Path:
-    """A copy of the run that says it is of another seed."""
+    """A copy of the run that says it is of another seed, wherever a run says it."""
     other = Path(f"seed{seed}")
     shutil.copytree(run, other)
+    other_config(other, "seed=3", f"seed={seed}")
     other_config(other, "\nseed: 3", f"\nseed: {seed}")
+    directory = RunDirectory(other)
+    versions = directory.versions() | {"configuration": identity_hash(directory.settings())}
+    directory.versions_file.write_bytes(encode_json(versions))
     other_score(other, "seed", value=seed)
     return other
 
@@ -85,7 +91,7 @@ def other_score(run: Path, *path: str, value: Any) -> None:
     for name in path[:-1]:
         inner = inner[name]
     inner[path[-1]] = value
-    (run / "score.json").write_text(json.dumps(content))
+    (run / "score.json").write_bytes(encode_json(content))
 
 
 def other_config(run: Path, before: str, after: str) -> None:
@@ -179,7 +185,7 @@ def test_a_score_by_another_protocol_is_made_again(
     content = json.loads((finished / "score.json").read_text())
     content["score"]["protocol"] = content["score"]["origin"]["protocol"]["name"] = "smoke"
     content["score"]["nominal"]["normalized_reward"] = 0.99
-    (finished / "score.json").write_text(json.dumps(content))
+    (finished / "score.json").write_bytes(encode_json(content))
     assert submit("one") == 0
     score = submission.read_entry(ENTRY).kept[0].record.score
     assert score.protocol == "quick"
@@ -289,7 +295,7 @@ def test_a_claim_that_the_policy_does_not_earn(
         factor = 1.25 if perturbed[name] else 0.0
         score[name] = perturbed[name] = perturbed[name] * factor
     score["against_plan"] *= 1.25
-    (finished / "score.json").write_text(json.dumps(content))
+    (finished / "score.json").write_bytes(encode_json(content))
     assert not contradictions(RunDirectory(finished).record().score, task)
     assert submit("one") == 0
     assert cli.main(["verify", str(ENTRY), "--quick"]) == 0

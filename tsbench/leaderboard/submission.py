@@ -38,6 +38,7 @@ from tsbench.evaluation.evaluate import check_fit
 from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.replay import contradictions
 from tsbench.evaluation.score import Score
+from tsbench.leaderboard import coherence
 from tsbench.runs import directory
 from tsbench.runs.directory import Record, RunDirectory, Stage
 from tsbench.runs.schema import SEEDS
@@ -430,6 +431,7 @@ def _read_training(run: RunDirectory, training: Training, manifest: Manifest) ->
         )
     if wrong := contradictions(record.score, task):
         raise TsbenchError(f"{run.score_file} contradicts itself: {'; '.join(wrong)}")
+    coherence.check(run, record, task)
     log = run.actions(task)
     wanted = (task.horizon, 1 + origin.protocol.logged, task.action_size)
     if log is None or log.actions.shape != wanted:
@@ -446,8 +448,12 @@ def _check_agreement(
         ("task", [manifest.task, info.task, record.task, score.origin.task]),
         (
             "version of the task",
-            [manifest.task_version, info.task_version, record.task_version,
-             score.origin.task_version],
+            [
+                manifest.task_version,
+                info.task_version,
+                record.task_version,
+                score.origin.task_version,
+            ],
         ),
         ("protocol", [manifest.protocol, score.protocol, score.origin.protocol.name]),
         ("method", [manifest.method, info.method, record.method]),
@@ -456,8 +462,12 @@ def _check_agreement(
         ("policy", [info.sha256, score.origin.policy]),
         ("score", [training.claimed, Claim.of(score)]),
         ("cost", [cost(training), cost_of(record)]),
-        ("versions", [training.versions, _packages(versions) if versions else training.versions]),
-    ]  # fmt: skip
+    ]
+    if versions:
+        said += [
+            ("versions", [training.versions, _packages(versions)]),
+            ("commit", [training.code, versions.get("commit")]),
+        ]
     config = run.config() if run.config_file.exists() else None
     if config is not None:
         said += [
