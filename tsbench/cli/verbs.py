@@ -126,7 +126,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status = _dispatch(words)
         sys.stdout.flush()
     except TsbenchError as error:
-        return _fail(str(error), 2)
+        status = _fail(str(error), 2)
+        try:
+            sys.stdout.flush()
+        except OSError:  # the reader closed the output of a run
+            _drop_output()
     except Stopped as stopped:
         return _fail(str(stopped), 128 + stopped.signal)
     except KeyboardInterrupt:
