@@ -4,20 +4,25 @@ Sphinx loads this file as an extension (docs/conf.py). Before it reads the sourc
 written into docs/tasks/ and docs/methods/, and the tables to docs/board.md; git ignores all of
 them. After the pages are written, each task's best entry is drawn in 3-D into the site's views/.
 
-`python docs/cards.py` writes the table of results into README.md.
+`python docs/cards.py` writes the table of results into README.md, and `python docs/cards.py films`
+the films and pictures of these entries, which takes a minute a task.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
+import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import imageio_ffmpeg
 import numpy as np
+from PIL import Image
 
 from tsbench import gym, methods, tasks
 from tsbench.core import plugins
@@ -194,17 +199,60 @@ def _method(row: Row) -> str:
 
 
 def _film(table: Table) -> str:
-    """The strip of the best motion, a link to its 3-D view."""
+    """The film of the best motion, a strip of it, and a link to its 3-D view."""
     best = _shown(table)
     if best is None:
         return ""
-    name = table.task
-    picture = f"pictures/{name}.png"
-    link = f'<a href="../views/{name}.html">The plan beside the motion of `{best.name}`, in 3-D</a>'
-    if not (DOCS / picture).is_file():
-        return link
-    words = f"{name}: the plan above, its execution below, at six instants"
-    return f'<a href="../views/{name}.html">![{words}](../{picture})</a>\n\n{link}'
+    name, parts = table.task, []
+    if (DOCS / f"static/{name}.mp4").is_file():
+        robot = tasks.make(name).drawing().robot
+        about = f"{name}: the motion of {best.name}; the translucent blue {robot} is the plan"
+        parts.append(
+            f'<video class="film" loop muted playsinline controls preload="none"\n'
+            f'  poster="../_static/{name}.jpg" aria-label="{about}">\n'
+            f'  <source src="../_static/{name}.mp4" type="video/mp4">\n</video>'
+        )
+    if (DOCS / f"pictures/{name}.png").is_file():
+        words = f"{name}: the plan above, its execution below, at six instants"
+        parts.append(f"![{words}](../pictures/{name}.png)")
+    words = f"The plan beside the motion of `{best.name}`, in 3-D"
+    return "\n\n".join([*parts, f'<a href="../views/{name}.html">{words}</a>'])
+
+
+def write_films() -> Iterable[Path]:
+    """Films, posters and strips of the entries that the cards show, in place of older ones."""
+    for table in board()[0]:
+        if (row := _shown(table)) is None:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            film, strip = Path(folder, "film.mp4"), Path(folder, "strip.png")
+            # A process of its own chooses its OpenGL before it imports mujoco.
+            words = ["view", str(_folder(row)), "--video", str(film), "--strip", str(strip)]
+            subprocess.run([sys.executable, "-m", "tsbench", *words], check=True)
+            yield _smaller_film(film, DOCS / f"static/{table.task}.mp4")
+            yield _smaller_picture(strip, DOCS / f"pictures/{table.task}.png")
+
+
+def _smaller_film(film: Path, place: Path) -> Path:
+    """Writes a film so that it takes about a hundred kilobytes, and its poster beside it."""
+    options = ["-crf", "32", "-preset", "slower", "-movflags", "+faststart"]
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", "-i", str(film)]
+    subprocess.run([*program, *options, str(place)], check=True)
+    frames = imageio_ffmpeg.read_frames(str(film), input_params=["-ss", "1.5"])
+    poster = Image.frombytes("RGB", next(frames)["size"], next(frames))
+    poster.save(place.with_suffix(".jpg"), quality=80)
+    return place
+
+
+def _smaller_picture(picture: Path, place: Path) -> Path:
+    """Writes a picture with 128 colours."""
+    Image.open(picture).quantize(128).save(place, optimize=True)
+    return place
+
+
+def _folder(row: Row) -> Path:
+    """Of the training that represents an entry."""
+    return row.entry.kept[0].run.path
 
 
 def _shown(table: Table) -> Row | None:
@@ -356,7 +404,7 @@ def _write_views(app: Sphinx, exception: Exception | None) -> None:
     folder.mkdir(exist_ok=True)
     for table in board()[0]:
         if (row := _shown(table)) is not None:
-            show = subject(str(row.entry.kept[0].run.path)).show(None)
+            show = subject(str(_folder(row))).show(None)
             write_whole(folder / f"{table.task}.html", viewer.render(show).encode())
 
 
@@ -368,6 +416,10 @@ def with_results(text: str) -> str:
 
 
 def main() -> None:
+    if sys.argv[1:] == ["films"]:
+        for path in write_films():
+            sys.stdout.write(f"{path}\n")
+        return
     readme = ROOT / "README.md"
     write_whole(readme, with_results(readme.read_text(encoding="utf-8")).encode())
 

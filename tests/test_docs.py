@@ -364,6 +364,22 @@ def test_each_task_and_method_has_a_card(tmp_path: Path) -> None:
             assert f"| {entry.name} | " in (tmp_path / "board.md").read_text()
 
 
+def test_a_card_shows_its_film(tmp_path: Path) -> None:
+    """With a poster, since a browser loads it only when asked; small enough for a checkout."""
+    cards().write_pages(tmp_path)
+    films = sorted((ROOT / "docs" / "static").glob("*.mp4"))
+    assert films
+    for path in films:
+        assert path.stat().st_size < 300_000
+        assert path.with_suffix(".jpg").stat().st_size < 100_000
+        card = (tmp_path / "tasks" / f"{path.stem}.md").read_text()
+        assert f'<source src="../_static/{path.name}"' in card
+        assert f'poster="../_static/{path.stem}.jpg"' in card
+    shown = re.findall(r"_static/([\w.]+)", (ROOT / "docs" / "index.md").read_text())
+    assert shown
+    assert all((ROOT / "docs" / "static" / name).is_file() for name in shown)
+
+
 def test_the_readme_has_the_results_of_the_board() -> None:
     readme = PAGES[0].read_text(encoding="utf-8")
     assert cards().results() in readme

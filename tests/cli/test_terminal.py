@@ -21,7 +21,8 @@ from tsbench import methods, tasks
 from tsbench.cli import describe, doctor, hints, places, streams, tables, usage, verbs
 from tsbench.cli.launch import directory
 from tsbench.core.errors import TsbenchError
-from tsbench.leaderboard import kept
+from tsbench.core.words import number
+from tsbench.leaderboard import kept, page
 from tsbench.runs import config
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.runs.execute import _way_on
@@ -157,6 +158,11 @@ def test_words_of_run(
         ([TASK], f"(did you mean 'tsbench run {TASK}'?)"),
         (["list", "--jsn", "x"], "(did you mean --json?)"),
         (["evaluate", "laikago_trot/twostag"], "the kept entry laikago_trot/twostage?)"),
+        (["verify", "laikago_trot/twostag"], "the kept entry laikago_trot/twostage?)"),
+        (["compare", "laikago_trt/prm"], "the kept entry laikago_trot/prm?)"),
+        (["view", "laikago_trot"], "(did you mean the kept entry laikago_trot/"),
+        (["report", "laikago_trt"], "(did you mean the kept entry laikago_trot/"),
+        (["evaluate", "one", TASK], "no policy one; without a file there are random and zero"),
         (["evaluate", "x.zip", TASK, "--trust-sb3", "ppo"], "(did you mean 'PPO'?)"),
         (["describe", "Rocket_Navigation"], "(did you mean 'rocket_navigation'?)"),
     ],
@@ -269,6 +275,17 @@ def test_kept_entries_have_short_names() -> None:
             assert RunDirectory(first).policy().info.task == entry.parent.name
 
 
+def test_a_score_is_compared_with_the_figures_of_the_board() -> None:
+    board = next(folder for folder in kept.FOLDERS if folder.is_dir())
+    for table in page.tables(board)[0]:
+        rows = {label.split()[1]: figures for label, *figures in
+                tables.kept_rows(tasks.make(table.task))}  # fmt: skip
+        assert rows == {
+            f"{table.task}/{row.name}": [number(row.reward.iqm), number(row.figures["success"])]
+            for row in table.rows
+        }
+
+
 def test_what_exists_here_comes_before_a_kept_entry(tmp_path: Path) -> None:
     name = next(iter(kept.entries()))
     (tmp_path / name).mkdir(parents=True)
@@ -282,6 +299,24 @@ def test_missing_trainings_and_entries_are_left_as_they_are() -> None:
     assert places.run("nowhere") == Path("nowhere")
     with pytest.raises(TsbenchError, match=re.escape(f"did you mean the kept entry {name}?")):
         places.run(f"{name}x")
+
+
+def test_the_board_of_the_kept_entries_is_shown_anywhere(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """It is only read: a file is written to a board that is here or that is named."""
+    assert verbs.main(["leaderboard"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("## ")
+    for name in kept.entries():
+        task, _, entry = name.partition("/")
+        assert re.search(rf"^## {task}$(?:(?!^## ).)*^\| {entry} \|", text, re.M | re.S)
+    for words in (["leaderboard", "--readme"], ["verify", "--all", "--record"]):
+        assert verbs.main(words) == 2
+        assert "no board leaderboards: --board names its directory" in capsys.readouterr().err
+    assert verbs.main(["leaderboard", "--board", "nowhere"]) == 2
+    assert "no board nowhere" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 # Directories of runs

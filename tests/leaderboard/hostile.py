@@ -559,7 +559,7 @@ READ_BY = {
     ),
     "resume": ("config.yaml", "versions.json"),
     "submit": ("policy.json", "policy.safetensors", "config.yaml", "score.json", "actions.npz",
-               "versions.json", "plan.npz", "reference.npz"),
+               "versions.json", "plan.npz", "reference.npz", "metrics.jsonl"),
 }  # fmt: skip
 ABSENT = {  # whose absence is no fault
     ("gone", name) for name in ("config.yaml", "actions.npz", "plan.npz", "reference.npz",

@@ -118,10 +118,10 @@ def test_runs_become_an_entry(finished: Path, capsys: pytest.CaptureFixture[str]
     assert "not kept: the trainings with seeds 5" in shown
     entry = submission.read_entry(ENTRY)
     assert [kept.training.seed for kept in entry.kept] == [3, 4]
-    files = {"actions.npz", "config.yaml", "plan.npz", "policy.json", "policy.safetensors",
-             "reference.npz", "score.json", "versions.json"}  # fmt: skip
+    files = {"actions.npz", "config.yaml", "metrics.jsonl", "plan.npz", "policy.json",
+             "policy.safetensors", "reference.npz", "score.json", "versions.json"}  # fmt: skip
     assert {path.name for path in (ENTRY / "seed3").iterdir()} == files
-    for name in files:
+    for name in files - {"metrics.jsonl"}:
         assert (ENTRY / "seed3" / name).read_bytes() == (finished / name).read_bytes()
     training = entry.kept[0].training
     record = RunDirectory(finished).record()
@@ -135,7 +135,9 @@ def test_runs_become_an_entry(finished: Path, capsys: pytest.CaptureFixture[str]
     assert manifest.files["seed3/plan.npz"].sha256 == digest
     assert [path.name for path in Path("board").iterdir()] == ["quick"]  # nothing half-made
     assert submit("one") == 2
-    assert "exists and nothing is overwritten" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "exists and nothing is overwritten" in told.err
+    assert "replayed" not in told.out + told.err  # it is refused before it is verified
 
 
 def test_an_entry_is_verified_in_full_and_the_verdict_kept(
@@ -167,13 +169,63 @@ def test_a_check_keeps_nothing(finished: Path, capsys: pytest.CaptureFixture[str
     assert not list(Path("board").iterdir())
 
 
-def test_kept_runs_get_a_manifest_where_they_are(finished: Path) -> None:
+def test_an_entry_keeps_the_learning_curves(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a long training few rows; what the training did not learn by is left out."""
+    row = {"stage": "plan", "seconds": 0.5, "episode_return": 2.0, "normalized_return": 0.1}
+    rows = [{**row, "steps": 10 * step, "kl": 0.01} for step in range(1, 1001)]
+    rows.append({"stage": "search", "steps": 9, "seconds": 1.0})
+    (finished / "metrics.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in rows))
+    assert submit("one") == 0
+    kept = [json.loads(line) for line in (ENTRY / "seed3/metrics.jsonl").read_text().splitlines()]
+    assert len(kept) == 200
+    assert (kept[0], kept[-1]) == ({**row, "steps": 10}, {**row, "steps": 10_000})
+    capsys.readouterr()
+    assert cli.main(["report", str(ENTRY / "seed3"), "--html", "report.html"]) == 0
+    assert "How it learned" in Path("report.html").read_text()
+    assert cli.main(["compare", str(ENTRY), "--png", "curves.png"]) == 0
+    assert submission.read_entry(ENTRY)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"entropy": 1.0}, "holds more than the learning curves"),
+        ({"episode_return": 1e300}, "a row lacks its stage, steps or return"),
+        ({"steps": "many"}, "a row lacks its stage, steps or return"),
+        ({"stage": "x" * 65}, "a row lacks its stage, steps or return"),
+    ],
+)
+def test_an_entry_keeps_nothing_but_curves(
+    change: dict[str, Any], line: str, finished: Path
+) -> None:
+    assert submit("one") == 0
+    metrics = ENTRY / "seed3" / "metrics.jsonl"
+    first, *others = metrics.read_text().splitlines()
+    text = "\n".join([json.dumps({**json.loads(first), **change}), *others, ""])
+    metrics.write_text(text)
+    manifest = submission.read_manifest(ENTRY)
+    files = {**manifest.files, "seed3/metrics.jsonl": submission.hash_of(text.encode())}
+    (ENTRY / "manifest.json").write_bytes(replace(manifest, files=files).encode())
+    with pytest.raises(TsbenchError, match=line):
+        submission.read_entry(ENTRY)
+
+
+def test_kept_runs_get_a_manifest_where_they_are(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     ENTRY.mkdir(parents=True)
     for path in finished.iterdir():
         if path.name in submission.LIMITS:
             (ENTRY / "seed3").mkdir(exist_ok=True)
             shutil.copy(path, ENTRY / "seed3")
     before = {path: path.stat().st_mtime_ns for path in (ENTRY / "seed3").iterdir()}
+    assert submit(str(ENTRY / "seed3")) == 2
+    assert "metrics.jsonl is not what an entry keeps of it" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in (ENTRY / "seed3").iterdir()} == before
+    (ENTRY / "seed3" / "metrics.jsonl").unlink()
+    del before[ENTRY / "seed3" / "metrics.jsonl"]
     assert submit(str(ENTRY / "seed3")) == 0
     assert {path: path.stat().st_mtime_ns for path in (ENTRY / "seed3").iterdir()} == before
     assert submission.read_entry(ENTRY).manifest.method == "twostage"
@@ -432,8 +484,8 @@ def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]
     trained(Path("one").absolute(), [*words, "task.budgets.smoke.act=512"])
     assert submit("one") == 0
     assert {path.name for path in (ENTRY / "seed0").iterdir()} == {
-        "actions.npz", "config.yaml", "policy.json", "policy.safetensors", "score.json",
-        "versions.json",
+        "actions.npz", "config.yaml", "metrics.jsonl", "policy.json", "policy.safetensors",
+        "score.json", "versions.json",
     }  # fmt: skip
     run = str(ENTRY / "seed0")
     assert cli.main(["view", run, "--html", "entry.html"]) == 0

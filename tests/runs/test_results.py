@@ -13,10 +13,10 @@ import pytest
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_json
 from tsbench.runs import config, results
-from tsbench.runs.directory import Record, RunDirectory
+from tsbench.runs.directory import POINTS, Record, RunDirectory
 from tsbench.runs.execute import prepare
 from tsbench.runs.provenance import write_provenance
-from tsbench.runs.results import POINTS, Result, Results
+from tsbench.runs.results import Result, Results
 
 ROCKET = ["task=rocket_navigation", "budget=smoke"]
 

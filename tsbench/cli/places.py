@@ -32,17 +32,50 @@ def run(word: str) -> Path:
     if place.is_file() and place.name in PARTS:
         place = place.parent
     if not (place.exists() or place.is_symlink()):
-        found = kept.find(word)
-        near = nearest(word, kept.entries()) if found is None and "/" in word else None
-        if near is not None:
-            raise TsbenchError(f"no run directory {place} (did you mean the kept entry {near}?)")
-        place = found or place
+        place = _kept(word, "run directory") or place
     if not (place / "policy.json").exists() and (seeds := kept.trainings(place)):
         return seeds[0]
     return place
 
 
 def entry(word: str) -> Path:
-    """The directory of an entry: the one that a word names, or a kept one's, TASK/ENTRY."""
+    """The directory of an entry: the one that a word names, or a kept one's, TASK/ENTRY.
+
+    Raises:
+        TsbenchError: as `run`.
+    """
     place = path(word)
-    return place if place.exists() or place.is_symlink() else kept.find(word) or place
+    return place if place.exists() or place.is_symlink() else _kept(word, "directory") or place
+
+
+def board(given: Path | None, here: Path, *, written: bool) -> Path:
+    """The board: the one that an option gives, the one here, or that of the kept entries, which
+    commands only read.
+
+    Raises:
+        TsbenchError: there is none, or none here to write to.
+    """
+    kept_board = next((folder for folder in kept.FOLDERS if folder.is_dir()), here)
+    chosen = given or (here if here.is_dir() or written else kept_board)
+    if not chosen.is_dir():
+        raise TsbenchError(f"no board {chosen}: --board names its directory")
+    return chosen
+
+
+def _kept(word: str, what: str) -> Path | None:
+    """The kept entry of that name; None if nothing is called nearly so.
+
+    Raises:
+        TsbenchError: there is none, but one with much the same name, or entries of a task with it.
+    """
+    found, entries = kept.find(word), kept.entries()
+    if found is None and "/" in word:
+        near = nearest(word, entries)
+    elif found is None:
+        task = nearest(word, {name.partition("/")[0] for name in entries})
+        near = next((name for name in entries if name.startswith(f"{task}/")), None)
+    else:
+        return found
+    if near is not None:
+        raise TsbenchError(f"no {what} {path(word)} (did you mean the kept entry {near}?)")
+    return None

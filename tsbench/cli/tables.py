@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -16,7 +17,7 @@ from tsbench.core.task import Task
 from tsbench.core.words import command, duration, number, short
 from tsbench.evaluation.flips import Flips
 from tsbench.evaluation.score import Score
-from tsbench.evaluation.statistics import RANKED_SEEDS
+from tsbench.evaluation.statistics import RANKED_SEEDS, iqm
 from tsbench.evaluation.words import (
     FIGURES,
     counts,
@@ -68,8 +69,8 @@ def show_score(console: Console, title: str, score: Score, task: Task[Any], *mor
 
 
 def kept_rows(task: Task[Any]) -> Iterator[tuple[str, str, str]]:
-    """Rows of a kept entry's name, its `solved_reward` and its `success`, means over its trainings,
-    of the entries for a task."""
+    """Rows of a kept entry's name, its `solved_reward` (the interquartile mean over its trainings,
+    as on the board) and its mean `success`, of the entries for a task."""
     for name, entry in kept.entries().items():
         if not name.startswith(f"{task.name}/"):
             continue
@@ -77,7 +78,7 @@ def kept_rows(task: Task[Any]) -> Iterator[tuple[str, str, str]]:
         if manifest.task_version == task.version:
             claims = [training.claimed for training in manifest.trainings]
             label = f"kept {name}" + (f" ({len(claims)} seeds)" if len(claims) > 1 else "")
-            reward = sum(one.solved_reward for one in claims) / len(claims)
+            reward = iqm([np.array([one.solved_reward for one in claims])])
             success = sum(one.success for one in claims) / len(claims)
             yield label, number(reward), number(success)
 

@@ -492,6 +492,9 @@ def _policy(
         raise TsbenchError(f"no run directory {path}")
     task = tasks.checked(name)
     named = references.named(path, task)
+    if named is None and not (path.exists() or path.is_symlink()):
+        others = " and ".join(references.POLICIES)
+        raise TsbenchError(f"no policy {path}; without a file there are {others}")
     return named or foreign.load(path, task, trust_sb3, vecnormalize), task
 
 
@@ -781,6 +784,7 @@ def _export(words: Sequence[str]) -> None:
 
 
 BOARD = Path("leaderboards")
+BOARD_HELP = "(leaderboards here, else the kept entries)"
 
 
 def _submit(words: Sequence[str]) -> int:
@@ -844,12 +848,14 @@ def _submit(words: Sequence[str]) -> int:
         rescore=options.rescore,
     )  # fmt: skip
     try:
+        if not options.check:
+            submission.home(packed, options.board, V1, options.runs)
         asked = verify.Asked(rescore=options.check, threads=options.threads)
         verdict = verify.verify(packed, asked, _tell(console))
         _show_verdict(Console(), verdict)
         if verdict.passed and not options.check:
-            home = submission.place(packed, options.board, V1, options.runs)
-            sys.stdout.write(f"{home}\n")
+            place = submission.place(packed, options.board, V1, options.runs)
+            sys.stdout.write(f"{place}\n")
     finally:
         submission.discard(packed)
     write_json(options.json, verify.plain(verdict))
@@ -871,7 +877,7 @@ def _verify(words: Sequence[str]) -> int:
     flag("--in", dest="checkout", type=places.path, default=Path(), metavar="DIRECTORY",
          help="with --pull-request: the repository (here)")  # fmt: skip
     flag("--comment", type=_new_file, metavar="FILE", help="write the verdicts as Markdown too")
-    flag("--board", type=places.path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--board", type=places.path, metavar="DIRECTORY", help=BOARD_HELP)
     flag("--threads", type=_threads, metavar="N", help="CPU threads (all)")
     options = parser.parse_args(words)
     if sum((bool(options.entries), options.all, options.pull_request is not None)) != 1:
@@ -882,19 +888,21 @@ def _verify(words: Sequence[str]) -> int:
     from tsbench.leaderboard import pull_request, verify
 
     console = Console()
+    written = options.record or options.retract is not None
+    board = places.board(options.board, BOARD, written=written)
     faults: list[str] = []
     if options.pull_request is not None:
         entries, faults = pull_request.entries(options.checkout, options.pull_request)
     else:
-        entries = verify.entries(options.board) if options.all else options.entries
+        entries = verify.entries(board) if options.all else options.entries
     if options.all and not entries:
-        raise TsbenchError(f"no entries in {options.board}")
+        raise TsbenchError(f"no entries in {board}")
     train = None
     if options.retrain:
         from tsbench.runs.execute import execute
 
         train = execute
-    seed = options.seed_file and verify.hidden_seed(options.seed_file, options.board)
+    seed = options.seed_file and verify.hidden_seed(options.seed_file, board)
     asked = verify.Asked(not options.quick, seed, train, options.threads)
     verdicts = []
     for fault in faults:
@@ -906,8 +914,8 @@ def _verify(words: Sequence[str]) -> int:
             verdict = verify.verify(entry, asked, _tell(Console(stderr=True)))
         _show_verdict(console, verdict)
         verdicts.append(verdict)
-        if verdict.digest and (options.record or options.retract is not None):
-            sys.stdout.write(f"{verify.record(options.board, entry, verdict)}\n")
+        if verdict.digest and written:
+            sys.stdout.write(f"{verify.record(board, entry, verdict)}\n")
     if options.comment:
         write_new(options.comment, verify.comment(verdicts, faults).encode())
     shown = {"refused": faults, "verdicts": [verify.plain(verdict) for verdict in verdicts]}
@@ -920,7 +928,7 @@ def _verify(words: Sequence[str]) -> int:
 def _leaderboard(words: Sequence[str]) -> None:
     parser = _parser("leaderboard", json=False)
     flag = parser.add_argument
-    flag("--board", type=places.path, default=BOARD, metavar="DIRECTORY", help="(leaderboards)")
+    flag("--board", type=places.path, metavar="DIRECTORY", help=BOARD_HELP)
     flag("--html", type=places.path, metavar="DIRECTORY", help="write the site there")
     flag("--plain", action="store_true", help="a site without 3-D views and figures, in seconds")
     flag("--readme", action="store_true", help="write the tables into README.md of the board")
@@ -932,18 +940,20 @@ def _leaderboard(words: Sequence[str]) -> None:
     from tsbench.leaderboard import page
     from tsbench.viewer import report
 
+    board = places.board(options.board, BOARD, written=options.readme)
     if options.html:
         render = None if options.plain else report.render
-        written = page.write_site(options.board, options.html, render, _tell(Console(stderr=True)))
+        written = page.write_site(board, options.html, render, _tell(Console(stderr=True)))
         sys.stdout.write(f"{written[0]}\n")
     if options.readme or not options.html:
-        readme = options.board / "README.md"
+        readme = board / "README.md"
         with os_errors(readme):
             before = readme.read_text(encoding="utf-8") if readme.exists() else "# Leaderboards\n"
-            text = page.markdown(*page.tables(options.board), before.partition("\n## ")[0])
+            text = page.markdown(*page.tables(board), before.partition("\n## ")[0])
             if options.readme:
                 write_whole(readme, text.encode())
-        sys.stdout.write(f"{readme}\n" if options.readme else text.partition("\n## ")[2])
+        tables = text[text.index("\n## ") + 1 :]
+        sys.stdout.write(f"{readme}\n" if options.readme else tables)
 
 
 def _tell(console: Console) -> Callable[[str], None]:

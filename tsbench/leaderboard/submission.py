@@ -8,6 +8,7 @@ An entry is a directory `v1/TASK/ENTRY/` of a board (`leaderboards/` in the repo
         score.json, actions.npz              its score, and actions to replay the physics from
         config.yaml, versions.json           how it was trained, if tsbench trained it
         plan.npz, reference.npz, roadmap.npz     what was planned, if its method plans
+        metrics.jsonl                        learning curves (`directory.thin_metrics`)
 
 The manifest is written in one way only (`Manifest.encode`) and holds a hash of itself, so that a
 change of any byte of an entry is noticed. That is no signature: whoever changes a file can write
@@ -59,6 +60,7 @@ OPTIONAL = {
     "plan.npz": motion.MAX_FILE,
     "reference.npz": motion.MAX_FILE,
     "roadmap.npz": motion.MAX_FILE,
+    directory.METRICS: directory.MAX_CURVES,
 }
 LIMITS = {**NEEDED, **OPTIONAL}
 MAX_MANIFEST = 512 * 2**10  # bytes
@@ -432,6 +434,10 @@ def _read_training(run: RunDirectory, training: Training, manifest: Manifest) ->
     if wrong := contradictions(record.score, task):
         raise TsbenchError(f"{run.score_file} contradicts itself: {'; '.join(wrong)}")
     coherence.check(run, record, task)
+    if run.has_metrics and directory.thin_metrics(run.metrics_file) != read_file(
+        run.metrics_file, directory.MAX_CURVES
+    ):
+        raise TsbenchError(f"{run.metrics_file} holds more than the learning curves")
     log = run.actions(task)
     wanted = (task.horizon, 1 + origin.protocol.logged, task.action_size)
     if log is None or log.actions.shape != wanted:
@@ -593,26 +599,49 @@ def discard(entry: Path) -> None:
     shutil.rmtree(entry.parent.parent, ignore_errors=True)
 
 
+def home(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) -> Path:
+    """The place on the board of an entry that `pack` made.
+
+    Raises:
+        TsbenchError: there is another entry in that place, or the runs lie there and are not what
+            an entry keeps of them.
+    """
+    place = board / protocol.name / entry.parent.name / entry.name
+    with os_errors(place):
+        if not _lie_in(place, entry, runs):
+            check_new(place, parents=True)
+            return place
+        check_new(place / MANIFEST)
+        for name in read_manifest(entry).files:
+            if (place / name).read_bytes() != (entry / name).read_bytes():
+                reason = "is not what an entry keeps of it: submit the run from elsewhere"
+                raise TsbenchError(f"{place / name} {reason}")
+    return place
+
+
 def place(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) -> Path:
     """Moves an entry that `pack` made to its place on the board.
 
     Runs that lie in that place already (`seedN`) stay as they are, and get the manifest.
 
     Raises:
-        TsbenchError: there is another entry in that place.
+        TsbenchError: as `home`.
     """
-    home = board / protocol.name / entry.parent.name / entry.name
-    with os_errors(home):
-        if home.is_dir() and {run.resolve() for run in runs} == {
-            (home / folder.name).resolve() for folder in entry.iterdir() if folder.is_dir()
-        }:
-            write_new(home / MANIFEST, (entry / MANIFEST).read_bytes())
+    there = home(entry, board, protocol, runs)
+    with os_errors(there):
+        if _lie_in(there, entry, runs):
+            write_new(there / MANIFEST, (entry / MANIFEST).read_bytes())
         else:
-            check_new(home, parents=True)
-            home.parent.mkdir(parents=True, exist_ok=True)
-            entry.rename(home)
+            there.parent.mkdir(parents=True, exist_ok=True)
+            entry.rename(there)
     discard(entry)
-    return home
+    return there
+
+
+def _lie_in(place: Path, entry: Path, runs: Sequence[Path]) -> bool:
+    """Whether the runs are the directories of an entry's trainings in that place already."""
+    folders = {(place / one.name).resolve() for one in entry.iterdir() if one.is_dir()}
+    return place.is_dir() and {run.resolve() for run in runs} == folders
 
 
 def _pack_run(
@@ -632,8 +661,10 @@ def _pack_run(
     folder.mkdir()
     for name, limit in LIMITS.items():
         path = run.path / name
-        if path.exists() or path.is_symlink():
+        if name != directory.METRICS and (path.exists() or path.is_symlink()):
             (folder / name).write_bytes(read_file(path, limit))
+    if run.has_metrics and (curves := directory.thin_metrics(run.metrics_file)):
+        (folder / directory.METRICS).write_bytes(curves)
     copy = RunDirectory(folder)
     before = copy.record() if copy.finished else None
     if before is None and told is None:

@@ -43,7 +43,9 @@ from tsbench.runs.schema import RunConfig
 STATES = ("submitted", "replayed", "re-scored", "hidden-seed", "re-trained")
 RETRACTED = "retracted"
 # What a state leaves unproved, for readers. No state proves what nobody can see from files.
-UNPROVED = "hardware, seconds, tuning trials, and which seeds were trained but not kept"
+UNPROVED = (
+    "hardware, seconds, learning curves, tuning trials, and which seeds were trained but not kept"
+)
 CLAIMS = {
     "submitted": f"every figure, the command, seeds, settings and steps, {UNPROVED}",
     "replayed": "every figure but those of the nominal episode, "

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import yaml
 
 from tsbench import tasks
@@ -26,11 +28,18 @@ from tsbench.runs.schema import RunConfig
 
 M = TypeVar("M", Plan, ReferenceMotion)
 
+# Learning curves as an entry keeps them: `metrics.jsonl` with fewer rows and figures.
+POINTS = 200  # of a stage
+MOST_STAGES = 16
+LARGEST = 1e15  # figures that can be drawn without an overflow
+RETURNS = ("episode_return", "normalized_return")
+
 # Limits of the files, in bytes. The largest of the kept entries are 1, 1 and 40 KB.
 MAX_CONFIG = 16 * 2**10
 MAX_VERSIONS = 64 * 2**10
 MAX_SCORE = 512 * 2**10
 MAX_METRICS = 32 * 2**20
+MAX_CURVES = 2 * 2**20
 MAX_FAILURE = 16 * 2**10
 
 # File names that `workspace` uses. `RunDirectory` has the paths of all files.
@@ -294,6 +303,36 @@ def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
         except ValueError as error:
             raise TsbenchError(f"damaged metrics {path}: {error}") from None
         yield row
+
+
+def thin_metrics(path: Path) -> bytes:
+    """A run's `metrics.jsonl` with the learning curves alone: of each stage at most `POINTS` rows,
+    the first and the last among them, with steps, seconds and returns. Thinning it again changes
+    nothing. Empty where there are no returns.
+
+    Raises:
+        TsbenchError: the file is missing or damaged.
+    """
+    stages: dict[str, list[dict[str, Any]]] = {}
+    for row in read_metrics(path):
+        stage = row.get("stage")
+        kept: dict[str, Any] = {key: row.get(key) for key in ("steps", "seconds")}
+        kept |= {name: row[name] for name in RETURNS if name in row}
+        if len(kept) == 2:
+            continue
+        numbers = all(type(one) in (int, float) and abs(one) < LARGEST for one in kept.values())
+        if not (isinstance(stage, str) and len(stage) <= 64 and numbers):
+            raise TsbenchError(f"damaged metrics {path}: a row lacks its stage, steps or return")
+        stages.setdefault(stage, []).append({"stage": stage, **kept})
+        if len(stages) > MOST_STAGES:
+            raise TsbenchError(f"damaged metrics {path}: more than {MOST_STAGES} stages")
+    lines = (json.dumps(rows[i]) for rows in stages.values() for i in thin(len(rows)))
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+def thin(count: int) -> np.ndarray:
+    """Indices of at most `POINTS` of `count` points, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, POINTS).round().astype(int))
 
 
 class _PlainLoader(yaml.SafeLoader):

@@ -304,7 +304,8 @@ def _create(run: RunDirectory) -> None:
         return
     elsewhere = "choose another directory=PATH"
     if run.finished:
-        raise taken(run.path, "a finished run", elsewhere)
+        other = "read its report.html, or choose another seed=N or directory=PATH"
+        raise taken(run.path, "a finished run", other)
     if run.failure:
         raise taken(run.path, "a run whose plan has failed", elsewhere)
     if run.config_file.exists():

@@ -32,13 +32,12 @@ from tsbench.core.files import parse_json, read_file, write_whole
 from tsbench.core.typed import typed
 from tsbench.core.words import command
 from tsbench.evaluation.score import Score
-from tsbench.runs.directory import MAX_SCORE, RunDirectory, Stage, read_metrics
+from tsbench.runs.directory import MAX_SCORE, RunDirectory, Stage, read_metrics, thin
 from tsbench.runs.schema import ELSEWHERE, RunConfig
 
 ROWS = "runs.jsonl"
 CURVES = "curves.npz"
 POLICIES = "policies"
-POINTS = 200  # of a learning curve, for each stage
 MEASURE = "normalized_return"  # of `metrics.jsonl`
 COMMAND = "tsbench run "  # begins a run's command
 CONSTANTS = "task.constants."
@@ -291,8 +290,7 @@ def read_curves(metrics: Path) -> tuple[Curve, ...]:
 def _thinned(points: Sequence[tuple[float, float, float]]) -> np.ndarray:
     """At most `POINTS` of them, the first and the last among them, shape (3, n), as they are kept
     in the file."""
-    chosen = np.unique(np.linspace(0, len(points) - 1, POINTS).round().astype(int))
-    return np.array(points, np.float32)[chosen].T
+    return np.array(points, np.float32)[thin(len(points))].T
 
 
 def load(place: Path) -> Results:

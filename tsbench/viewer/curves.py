@@ -11,13 +11,11 @@ from matplotlib.figure import Figure
 
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_new
-from tsbench.runs.directory import read_metrics
+from tsbench.runs.directory import LARGEST, MOST_STAGES, read_metrics
 
 Curve = tuple[list[Any], list[Any]]  # environment steps, returns
 
 MEASURE = "episode_return"
-LARGEST = 1e15  # figures that matplotlib draws without an overflow
-MOST_STAGES = 16
 
 
 def read_curves(metrics: Path) -> dict[str, Curve]:
