@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tsbench.cli import verbs as cli
+from tsbench import cli
 from tsbench.core.files import encode_json
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import V1

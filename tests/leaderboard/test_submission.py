@@ -19,8 +19,7 @@ import pytest
 import yaml
 from rich.console import Console
 
-from tsbench import tasks
-from tsbench.cli import verbs as cli
+from tsbench import cli, tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import encode_json
 from tsbench.core.motion import Plan

@@ -23,9 +23,8 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.util.tensor_util import make_ndarray
 
-from tsbench import tasks
+from tsbench import cli, tasks
 from tsbench.cli import launch
-from tsbench.cli import verbs as cli
 from tsbench.core import words
 from tsbench.core.errors import PlanError, TsbenchError
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
