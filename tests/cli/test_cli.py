@@ -35,11 +35,11 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return captured.err.removeprefix("tsbench: ").rstrip("\n")
 
 
-@pytest.mark.parametrize("words", [[], ["--help"], ["-h"]])
 def test_each_verb_is_a_module_of_its_name() -> None:
     assert {module.name for module in pkgutil.iter_modules(verbs.__path__)} == set(verbs.VERBS)
 
 
+@pytest.mark.parametrize("words", [[], ["--help"], ["-h"]])
 def test_help_names_every_command(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == 0
     out = capsys.readouterr().out
