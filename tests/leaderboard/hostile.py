@@ -583,10 +583,10 @@ def run_cases(verbs: list[str], contents: bool) -> Iterator[tuple[str, str, Chan
                     yield verb, f"{verb} {name}: {what}", written(name, content)
 
 
-def score_cases() -> Iterator[tuple[str, str, Change]]:
+def score_cases(chosen: dict[str, list[Any]]) -> Iterator[tuple[str, str, Change]]:
     """Scores that are not what a policy earns, or cannot be, as the report meets them. What it can
     show it shows: nobody says that it is true."""
-    for place, values in {**SCORE, **EDGES}.items():
+    for place, values in chosen.items():
         for i, value in enumerate(values):
             yield "report", f"report score.json {place} {i}", altered("score.json", place, value)
 
@@ -672,7 +672,9 @@ def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> No
     whole = intact(folder / "whole") / "seed0"
     (whole / "metrics.jsonl").write_text('{"stage": "plan", "steps": 1, "episode_return": 1.0}\n')
     found = run_cases([chosen] if chosen else [*READ_BY], only is None)
-    for verb, case, change in score_cases() if only == "scores" else found:
+    if only in ("scores", "edges"):
+        found = score_cases(EDGES if only == "edges" else {**SCORE, **EDGES})
+    for verb, case, change in found:
         out = Path(tempfile.mkdtemp(dir=folder))
         run = out / "a" / "b" / "run"
         shutil.copytree(whole, run)
@@ -750,7 +752,7 @@ def main() -> None:
     parser.add_argument("count", nargs="?", type=int, default=300)
     parser.add_argument("--start", type=int, default=0, help="of the random numbers")
     parser.add_argument("--verb", choices=READ_BY, help="of the runs, one alone")
-    parser.add_argument("--only", choices=("kinds", "scores"), help="of the runs")
+    parser.add_argument("--only", choices=("kinds", "scores", "edges"), help="of the runs")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="hostile-") as folder:
         os.chdir(folder)

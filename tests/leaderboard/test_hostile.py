@@ -78,3 +78,15 @@ def test_no_hostile_run_is_read(verb: str) -> None:
     for case in [found[0] | {"seconds": 0.0}, *found[1:]]:
         check_refused(case | {"MB": 0})
         assert case["line"].startswith("2 tsbench: "), case
+
+
+def test_numbers_and_texts_at_their_edges_are_drawn_or_refused() -> None:
+    """Whatever a score.json holds, the report of it is a page or one line."""
+    first, *found = cases("runs", "--only", "edges")
+    assert len(found) >= 20
+    for case in [first | {"seconds": 0.0}, *found]:
+        line = case["line"]
+        assert "TRACEBACK" not in line, line
+        assert case["accepted"] or line.startswith("2 tsbench: ")
+        assert "\n" not in line
+        assert case["seconds"] < SECONDS, case
