@@ -434,7 +434,7 @@ SCORE: dict[str, list[Any]] = {
 }  # fmt: skip
 EDGES: dict[str, list[Any]] = {  # of numbers, for who draws them
     "score/robustness/surface/forces_N": [[0.0] * 12, [1e308] * 12, [-1.0] * 12, [5e-324] * 12],
-    "score/robustness/surface/headings_rad": [[1e308] * 16, [0.0] * 16],
+    "score/robustness/surface/headings_rad": [[0.0] * 16, [1e308] * 16],
     "score/robustness/surface/phases": [[2**62] * 16, [-1] * 16, [0] * 16],
     "score/robustness/push_duration_s": [0.0, 1e308, -0.0],
     "score/robustness/mass_scale": [0.0, 1e308],
@@ -673,7 +673,8 @@ def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> No
     (whole / "metrics.jsonl").write_text('{"stage": "plan", "steps": 1, "episode_return": 1.0}\n')
     found = run_cases([chosen] if chosen else [*READ_BY], only is None)
     if only in ("scores", "edges"):
-        found = score_cases(EDGES if only == "edges" else {**SCORE, **EDGES})
+        edges = {place: values[-1:] for place, values in EDGES.items()}
+        found = score_cases(edges if only == "edges" else {**SCORE, **EDGES})
     for verb, case, change in found:
         out = Path(tempfile.mkdtemp(dir=folder))
         run = out / "a" / "b" / "run"
