@@ -11,7 +11,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from tsbench.cli.verbs import main
+from tsbench.cli import main
 
 if __name__ == "__main__":
     for path in sorted(Path(__file__).parent.glob("against_*.py")):

@@ -3,7 +3,7 @@
     make faults            50 kills, and every other fault once
     make faults N=3        3 kills and every other fault once, as in CI
 
-`verbs.main` starts the runs in forked processes, which saves each run some seconds of imports. A
+`cli.main` starts the runs in forked processes, which saves each run some seconds of imports. A
 signal kills a run in an iteration drawn at random or after the last one, after a random amount of
 processor time, which does not depend on the load of the machine. Then the run is resumed until it
 ends, and its files are compared with those of an uninterrupted run: the bytes of policy, plan and
@@ -38,7 +38,7 @@ import torch
 
 import tsbench.cli.launch
 import tsbench.viewer.report  # noqa: F401
-from tsbench.cli import verbs
+from tsbench import cli
 from tsbench.rl.ppo import Learner
 from tsbench.rl.rollout import Rollout
 from tsbench.sim.model import load_spec
@@ -99,7 +99,7 @@ class Process:
                 sys.argv = ["tsbench"]
                 if before is not None:
                     before()
-                status = verbs.main(words)
+                status = cli.main(words)
                 sys.stdout.flush()
                 sys.stderr.flush()
             except BaseException:

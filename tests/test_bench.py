@@ -18,7 +18,7 @@ from tsbench.bench import Comparison, Findings, gpu, scaling, stepping, training
 from tsbench.bench.domains import domains, planned, richest
 from tsbench.bench.training import split
 from tsbench.bench.turns import Case, Effort, Range, take_turns
-from tsbench.cli.verbs import main
+from tsbench.cli import main
 from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import ReferenceMotion

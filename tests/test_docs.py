@@ -34,7 +34,7 @@ import pytest
 import yaml
 
 from tsbench import cli, methods, tasks
-from tsbench.cli import verbs
+from tsbench.cli import arguments, verbs
 from tsbench.core.errors import TsbenchError
 from tsbench.runs import config
 
@@ -180,7 +180,7 @@ class ParsedError(Exception):
 def parsing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A verb stops after it has parsed its words."""
     for name in ("parse_args", "parse_intermixed_args"):
-        monkeypatch.setattr(verbs.Parser, name, _stopping(getattr(verbs.Parser, name)))
+        monkeypatch.setattr(arguments.Parser, name, _stopping(getattr(arguments.Parser, name)))
 
 
 def _stopping(parse: Callable[..., Any]) -> Callable[..., Any]:
@@ -219,7 +219,7 @@ def check_tsbench(words: list[str]) -> None:
                 assert cli.main(["run", *job, "--cfg", "job"]) == 0
     else:
         with pytest.raises(ParsedError):
-            verbs.VERBS[verb].call(rest)
+            verbs.call(verb, rest)
 
 
 def check_make(words: list[str]) -> None:

@@ -2,6 +2,6 @@
 
 import sys
 
-from tsbench.cli.verbs import main
+from tsbench.cli import main
 
 sys.exit(main())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tsbench import methods, tasks
+from tsbench import cli, methods, tasks
 from tsbench.cli import verbs
 
 TASK = "task=rocket_navigation"
@@ -26,7 +27,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     """The line of the error with which a command is refused."""
-    assert verbs.main(words) == 2
+    assert cli.main(words) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("tsbench: ")
@@ -34,9 +35,13 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return captured.err.removeprefix("tsbench: ").rstrip("\n")
 
 
+def test_each_verb_is_a_module_of_its_name() -> None:
+    assert {module.name for module in pkgutil.iter_modules(verbs.__path__)} == set(verbs.VERBS)
+
+
 @pytest.mark.parametrize("words", [[], ["--help"], ["-h"]])
 def test_help_names_every_command(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert verbs.main(words) == 0
+    assert cli.main(words) == 0
     out = capsys.readouterr().out
     for verb in verbs.VERBS:
         assert f"\n  {verb} " in out
@@ -45,7 +50,7 @@ def test_help_names_every_command(words: list[str], capsys: pytest.CaptureFixtur
 def test_help_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     for verb in verbs.VERBS:
         try:
-            status = verbs.main([verb, "--help"])
+            status = cli.main([verb, "--help"])
         except SystemExit as exit_:  # argparse's way
             status = int(exit_.code or 0)
         assert status == 0
@@ -53,12 +58,12 @@ def test_help_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert verbs.main(["--version"]) == 0
+    assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("tsbench 0.")
 
 
 def test_list_is_the_same_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert verbs.main(["list", "--json", "names.json"]) == 0
+    assert cli.main(["list", "--json", "names.json"]) == 0
     shown = capsys.readouterr().out
     content = json.loads((tmp_path / "names.json").read_text())
     assert tuple(content["tasks"]) == tasks.names()
@@ -82,7 +87,7 @@ def test_list_shows_tasks_without_a_configuration(
     def stroll() -> Any:
         return tasks.make(tasks.names()[0])
 
-    assert verbs.main(["list"]) == 0
+    assert cli.main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     row = next(line for line in lines if "stroll" in line)
     assert row.count("-") == 3
@@ -185,7 +190,7 @@ def test_an_existing_run_directory_is_refused(
 
 
 def test_the_configuration_can_be_shown(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert verbs.main(["run", TASK, "--cfg", "job", "seed=3", "task.training.plan.clip=0.3"]) == 0
+    assert cli.main(["run", TASK, "--cfg", "job", "seed=3", "task.training.plan.clip=0.3"]) == 0
     out = capsys.readouterr().out
     assert "seed: 3\n" in out
     assert "clip: 0.3\n" in out
@@ -207,7 +212,7 @@ def test_shell_completion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("COMP_LINE", line)
-    assert verbs.main(["-sc", "query=bash"]) == 0
+    assert cli.main(["-sc", "query=bash"]) == 0
     assert capsys.readouterr().out.strip() == expected
 
 

@@ -17,9 +17,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from tsbench import methods, tasks
-from tsbench.cli import describe, doctor, hints, places, streams, tables, usage, verbs
+from tsbench import cli, methods, tasks
+from tsbench.cli import command, describe, doctor, hints, places, streams, tables, usage
 from tsbench.cli.launch import directory
+from tsbench.cli.verbs import run, tune
 from tsbench.core.errors import TsbenchError
 from tsbench.core.words import number
 from tsbench.leaderboard import kept, page
@@ -107,7 +108,7 @@ def test_home_in_paths(tmp_path: Path) -> None:
 
 
 def test_home_in_an_option(tmp_path: Path) -> None:
-    assert verbs.main(["list", "--json=~/names.json"]) == 0
+    assert cli.main(["list", "--json=~/names.json"]) == 0
     assert (tmp_path / "names.json").exists()
 
 
@@ -145,7 +146,7 @@ def test_words_of_run(
 ) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.yaml").touch()
-    assert verbs.main(["run", *words]) == 2
+    assert cli.main(["run", *words]) == 2
     captured = capsys.readouterr()
     assert hint in captured.err
     assert captured.err.count("\n") == 1
@@ -173,7 +174,7 @@ def test_words_of_other_commands(
     words: list[str], hint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "x.zip").touch()
-    assert verbs.main(words) == 2
+    assert cli.main(words) == 2
     assert hint in capsys.readouterr().err
 
 
@@ -218,7 +219,7 @@ def test_list_cuts_no_name(
     width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
-    assert verbs.main(["list"]) == 0
+    assert cli.main(["list"]) == 0
     text = capsys.readouterr().out
     check_width(text, width)
     for name in (*tasks.names(), *methods.names()):
@@ -250,7 +251,7 @@ def test_scores_cut_no_name(width: int, invented_record: Callable[[str], Record]
 
 
 @pytest.mark.parametrize("width", [40, 72, 100])
-@pytest.mark.parametrize("text", [verbs.RUN_HELP, verbs.TUNE_HELP, verbs._help()])
+@pytest.mark.parametrize("text", [run.HELP, tune.HELP, command._help()])
 def test_help_follows_the_width(text: str, width: int) -> None:
     fitted = usage.fitted(text, width)
     examples = [line for line in text.splitlines() if line.startswith("  tsbench ")]
@@ -260,7 +261,7 @@ def test_help_follows_the_width(text: str, width: int) -> None:
 
 
 def test_wide_help_is_the_text_itself() -> None:
-    assert usage.fitted(verbs.RUN_HELP, 200) == verbs.RUN_HELP
+    assert usage.fitted(run.HELP, 200) == run.HELP
 
 
 # Kept entries
@@ -307,16 +308,16 @@ def test_the_board_of_the_kept_entries_is_shown_anywhere(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """It is only read: a file is written to a board that is here or that is named."""
-    assert verbs.main(["leaderboard"]) == 0
+    assert cli.main(["leaderboard"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("## ")
     for name in kept.entries():
         task, _, entry = name.partition("/")
         assert re.search(rf"^## {task}$(?:(?!^## ).)*^\| {entry} \|", text, re.M | re.S)
     for words in (["leaderboard", "--readme"], ["verify", "--all", "--record"]):
-        assert verbs.main(words) == 2
+        assert cli.main(words) == 2
         assert "no board leaderboards: --board names its directory" in capsys.readouterr().err
-    assert verbs.main(["leaderboard", "--board", "nowhere"]) == 2
+    assert cli.main(["leaderboard", "--board", "nowhere"]) == 2
     assert "no board nowhere" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -347,7 +348,7 @@ def test_the_doctor_says_what_works(
 ) -> None:
     monkeypatch.setattr(doctor, "_gpu", lambda: "none")
     monkeypatch.setattr("tsbench.gl.find_working_backend", lambda: None)
-    assert verbs.main(["doctor", "--json", "found.json"]) == 0
+    assert cli.main(["doctor", "--json", "found.json"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 12
     found = json.loads(Path("found.json").read_text())

@@ -15,8 +15,7 @@ import onnxruntime
 import pytest
 import torch
 
-from tsbench import TsbenchError, tasks
-from tsbench.cli import verbs
+from tsbench import TsbenchError, cli, tasks
 from tsbench.core.policy import Policy, PolicyInfo
 from tsbench.evaluation import deploy, foreign, on_robot
 from tsbench.sim.model import fingerprint
@@ -137,13 +136,13 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     run, out = tmp_path / "run", tmp_path / "out"
     run.mkdir()
     made(KINDS[0]).save(run)
-    assert verbs.main(["export", str(run), str(out)]) == 0
+    assert cli.main(["export", str(run), str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(":")[0] for line in lines] == [
         f"{out}/policy.safetensors", f"{out}/policy.onnx (opset 17, any number of rows)",
         f"{out}/policy.py",
     ]  # fmt: skip
-    assert verbs.main(["export", "rocket_navigation/prm", f"{out}1"]) == 0  # a kept entry
+    assert cli.main(["export", "rocket_navigation/prm", f"{out}1"]) == 0  # a kept entry
     assert (Path(f"{out}1") / "policy.onnx").is_file()
     (tmp_path / "p.onnx").touch()
     for words, line in (
@@ -155,7 +154,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         ([str(tmp_path / "p.onnx"), f"{out}2"], "task=NAME is missing"),
         ([str(tmp_path / "p.onnx"), f"task={TASK.name}", f"{out}2"], "--method NAME is missing"),
     ):
-        assert verbs.main(["export", *words]) == 2
+        assert cli.main(["export", *words]) == 2
         (error,) = capsys.readouterr().err.splitlines()
         assert line in error
     assert not Path(f"{out}2").exists()

@@ -20,8 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensordict import TensorDict
 
 import tsbench
-from tsbench import TsbenchError, tasks
-from tsbench.cli import verbs
+from tsbench import TsbenchError, cli, tasks
 from tsbench.core.policy import Policy
 from tsbench.evaluation import foreign
 
@@ -491,7 +490,7 @@ def test_the_command_line(
 ) -> None:
     path = str(write_onnx(tmp_path / "p.onnx"))
     words = ["evaluate", path, "task=rocket_navigation", "--protocol", "smoke"]
-    assert verbs.main(words) == 0
+    assert cli.main(words) == 0
     shown = capsys.readouterr().out
     assert "protocol smoke" in shown
     assert "not ranked: protocol smoke plays too few episodes" in shown
@@ -507,5 +506,5 @@ def test_the_command_line(
         (["zero", "task=rocket_navigation", "--protocol", "v0"], "unknown protocol 'v0'"),
         (["zero", "task=rocket_navigation", "--threads", "0"], "--threads: must be a whole number"),
     ):
-        assert verbs.main(["evaluate", *wrong]) == 2
+        assert cli.main(["evaluate", *wrong]) == 2
         assert message in capsys.readouterr().err

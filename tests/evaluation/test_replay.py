@@ -20,7 +20,7 @@ from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import constants_hash, machine
 from tsbench.evaluation.protocol import SMOKE
-from tsbench.evaluation.replay import compare, differences, replay
+from tsbench.evaluation.replay import compare, contradictions, differences, replay
 from tsbench.evaluation.score import Score
 from tsbench.tasks import laikago, rocket
 
@@ -265,6 +265,48 @@ def test_replay_finds_any_change(score: Score, log: ActionLog) -> None:
     reward = score.nominal.normalized_reward * 1.01
     other = replace(score, nominal=replace(score.nominal, normalized_reward=reward))
     assert not replay(TASK, other, log)
+
+
+def test_replay_finds_any_nominal_figure(score: Score, log: ActionLog) -> None:
+    """And a logged start that is said to be solved, or not to be."""
+    nominal, most = score.nominal, score.perturbed.solved
+    assert nominal.measures
+    forged: list[dict[str, Any]] = [
+        {"violations": 1.0 - nominal.violations},
+        {"steps": nominal.steps + 1.0},
+        {"goal_distance": nominal.goal_distance * 0.99},
+        {"success": 1.0 - nominal.success, "solved": (1 - nominal.solved[0],)},
+        *({"measures": {**nominal.measures, name: 0.123}} for name in nominal.measures),
+        *({"measures": {**nominal.measures, name: None}} for name in nominal.measures
+          if nominal.measures[name] is not None),
+    ]  # fmt: skip
+    for changes in forged:
+        assert not replay(TASK, replace(score, nominal=replace(nominal, **changes)), log), changes
+    for logged, found in ((0, False), (1, False), (2, True)):
+        solved = tuple(1 - one if i == logged else one for i, one in enumerate(most))
+        other = with_perturbed(score, solved=solved, success=float(np.mean(solved)))
+        assert replay(TASK, other, log) is found
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"steps": 10.1}, "steps is no mean of 3 counts"),
+        ({"violations": 0.5}, "violations is no mean of 3 counts"),
+        ({"goal_distance": -0.5}, "goal_distance is negative"),
+        (
+            {"normalized_reward": 0.5, "solved_reward": 0.4, "success": 1 / 3, "solved": (1, 0, 0)},
+            "solved_reward is larger than success",
+        ),
+        (
+            {"normalized_reward": 0.5, "solved_reward": 0.4, "success": 1.0, "solved": (1, 1, 1)},
+            "solved_reward is not normalized_reward, though every episode was solved",
+        ),
+    ],
+)
+def test_a_score_contradicts_itself(score: Score, changes: dict[str, Any], fault: str) -> None:
+    assert not contradictions(score, TASK)
+    assert f"perturbed: {fault}" in contradictions(with_perturbed(score, **changes), TASK)
 
 
 def test_a_log_of_something_else_does_not_replay(score: Score, log: ActionLog) -> None:

@@ -36,6 +36,8 @@ from safetensors.numpy import load, save
 
 from tsbench import cli
 from tsbench.core.errors import TsbenchError
+from tsbench.core.files import encode_json
+from tsbench.core.policy import encode_info
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import V1
 from tsbench.leaderboard import submission, verify
@@ -432,7 +434,7 @@ SCORE: dict[str, list[Any]] = {
 }  # fmt: skip
 EDGES: dict[str, list[Any]] = {  # of numbers, for who draws them
     "score/robustness/surface/forces_N": [[0.0] * 12, [1e308] * 12, [-1.0] * 12, [5e-324] * 12],
-    "score/robustness/surface/headings_rad": [[1e308] * 16, [0.0] * 16],
+    "score/robustness/surface/headings_rad": [[0.0] * 16, [1e308] * 16],
     "score/robustness/surface/phases": [[2**62] * 16, [-1] * 16, [0] * 16],
     "score/robustness/push_duration_s": [0.0, 1e308, -0.0],
     "score/robustness/mass_scale": [0.0, 1e308],
@@ -490,7 +492,8 @@ def altered(name: str, path: str, value: Any) -> Change:
         if name == "manifest.json":
             signed(folder, values)
         else:
-            (folder / name).write_text(json.dumps(values))
+            encode = encode_info if name.endswith("policy.json") else encode_json
+            (folder / name).write_bytes(encode(values))
 
     return change
 
@@ -580,10 +583,10 @@ def run_cases(verbs: list[str], contents: bool) -> Iterator[tuple[str, str, Chan
                     yield verb, f"{verb} {name}: {what}", written(name, content)
 
 
-def score_cases() -> Iterator[tuple[str, str, Change]]:
+def score_cases(chosen: dict[str, list[Any]]) -> Iterator[tuple[str, str, Change]]:
     """Scores that are not what a policy earns, or cannot be, as the report meets them. What it can
     show it shows: nobody says that it is true."""
-    for place, values in {**SCORE, **EDGES}.items():
+    for place, values in chosen.items():
         for i, value in enumerate(values):
             yield "report", f"report score.json {place} {i}", altered("score.json", place, value)
 
@@ -670,7 +673,10 @@ def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> No
     row = {"stage": "plan", "steps": 1, "seconds": 1.0, "episode_return": 1.0}
     (whole / "metrics.jsonl").write_text(f"{json.dumps(row)}\n")
     found = run_cases([chosen] if chosen else [*READ_BY], only is None)
-    for verb, case, change in score_cases() if only == "scores" else found:
+    if only in ("scores", "edges"):
+        edges = {place: values[-1:] for place, values in EDGES.items()}
+        found = score_cases(edges if only == "edges" else {**SCORE, **EDGES})
+    for verb, case, change in found:
         out = Path(tempfile.mkdtemp(dir=folder))
         run = out / "a" / "b" / "run"
         shutil.copytree(whole, run)
@@ -748,7 +754,7 @@ def main() -> None:
     parser.add_argument("count", nargs="?", type=int, default=300)
     parser.add_argument("--start", type=int, default=0, help="of the random numbers")
     parser.add_argument("--verb", choices=READ_BY, help="of the runs, one alone")
-    parser.add_argument("--only", choices=("kinds", "scores"), help="of the runs")
+    parser.add_argument("--only", choices=("kinds", "scores", "edges"), help="of the runs")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="hostile-") as folder:
         os.chdir(folder)

@@ -19,8 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensordict import TensorDict
 
 import tsbench.gym
-from tsbench import tasks
-from tsbench.cli import verbs as cli
+from tsbench import cli, tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.policy import Policy
 from tsbench.evaluation import export, foreign

@@ -11,11 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from tsbench.cli import verbs as cli
+from tsbench import cli
+from tsbench.core.files import encode_json
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import V1
 from tsbench.leaderboard import page, submission, verify
 from tsbench.leaderboard.submission import Described
+from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import identity_hash
 
 BOARD = Path(__file__).parents[2] / "leaderboards"
 RUN = min(BOARD.glob("v1/*/*/seed*"), key=lambda run: (run / "actions.npz").stat().st_size)
@@ -36,9 +39,14 @@ def of_seed(folder: Path, seed: int) -> Path:
     shutil.copytree(RUN, run)
     score = json.loads((run / "score.json").read_text())
     before, score["seed"] = score["seed"], seed
-    (run / "score.json").write_text(json.dumps(score))
+    (run / "score.json").write_bytes(encode_json(score))
     text = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(text.replace(f"\nseed: {before}", f"\nseed: {seed}"))
+    for word in ("\nseed: ", "seed="):
+        text = text.replace(f"{word}{before}", f"{word}{seed}")
+    (run / "config.yaml").write_text(text)
+    directory = RunDirectory(run)
+    versions = directory.versions() | {"configuration": identity_hash(directory.settings())}
+    directory.versions_file.write_bytes(encode_json(versions))
     return run
 
 

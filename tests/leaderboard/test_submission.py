@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -18,9 +19,9 @@ import pytest
 import yaml
 from rich.console import Console
 
-from tsbench import tasks
-from tsbench.cli import verbs as cli
+from tsbench import cli, tasks
 from tsbench.core.errors import TsbenchError
+from tsbench.core.files import encode_json
 from tsbench.core.motion import Plan
 from tsbench.evaluation import protocol as protocols
 from tsbench.evaluation.evaluate import evaluate
@@ -30,6 +31,7 @@ from tsbench.leaderboard import submission, verify
 from tsbench.leaderboard.submission import Described, Manifest
 from tsbench.runs import config, execute
 from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import identity_hash
 
 BOARD = Path(__file__).parents[2] / "leaderboards"
 KEPT = sorted(path.parent for path in BOARD.glob("v1/*/*/manifest.json"))
@@ -71,10 +73,14 @@ def finished(shown: Path) -> Path:
 
 
 def seeded(run: Path, seed: int) -> Path:
-    """A copy of the run that says it is of another seed."""
+    """A copy of the run that says it is of another seed, wherever a run says it."""
     other = Path(f"seed{seed}")
     shutil.copytree(run, other)
+    other_config(other, "seed=3", f"seed={seed}")
     other_config(other, "\nseed: 3", f"\nseed: {seed}")
+    directory = RunDirectory(other)
+    versions = directory.versions() | {"configuration": identity_hash(directory.settings())}
+    directory.versions_file.write_bytes(encode_json(versions))
     other_score(other, "seed", value=seed)
     return other
 
@@ -85,7 +91,7 @@ def other_score(run: Path, *path: str, value: Any) -> None:
     for name in path[:-1]:
         inner = inner[name]
     inner[path[-1]] = value
-    (run / "score.json").write_text(json.dumps(content))
+    (run / "score.json").write_bytes(encode_json(content))
 
 
 def other_config(run: Path, before: str, after: str) -> None:
@@ -231,7 +237,7 @@ def test_a_score_by_another_protocol_is_made_again(
     content = json.loads((finished / "score.json").read_text())
     content["score"]["protocol"] = content["score"]["origin"]["protocol"]["name"] = "smoke"
     content["score"]["nominal"]["normalized_reward"] = 0.99
-    (finished / "score.json").write_text(json.dumps(content))
+    (finished / "score.json").write_bytes(encode_json(content))
     assert submit("one") == 0
     score = submission.read_entry(ENTRY).kept[0].record.score
     assert score.protocol == "quick"
@@ -301,6 +307,54 @@ def test_what_does_not_belong_together_is_no_entry(
     assert not list(Path("board").iterdir())
 
 
+def test_files_that_are_swapped_while_they_are_scored(finished: Path) -> None:
+    """An entry holds what was read at the beginning, and the score is of that."""
+    other_score(finished, "score", "protocol", value="smoke")
+    other_score(finished, "score", "origin", "protocol", "name", value="smoke")
+    before = (finished / "policy.safetensors").read_bytes()
+    scored = []
+
+    def swapping(policy: Any, task: Any) -> Any:
+        for path in finished.iterdir():
+            path.write_bytes(b"something else") if path.is_file() else None
+        scored.append(policy.sha256)
+        return evaluate(policy, task, protocol=QUICK)
+
+    described = Described("mine", ("A. Person",), "MIT")
+    packed = submission.pack([finished], described, Path("board"), QUICK, score=swapping)
+    assert (packed / "seed3" / "policy.safetensors").read_bytes() == before
+    assert [kept.policy.sha256 for kept in submission.read_entry(packed).kept] == scored
+
+
+def test_a_full_disk_leaves_no_part_of_an_entry(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Wherever the disk is full, another try then finds nothing in its way."""
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for owner, name in ((Path, "write_bytes"), (submission, "write_new"), (Path, "rename")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, full)
+            assert submit("one") == 2
+        assert capsys.readouterr().err.endswith("No space left on device\n")
+        assert not [path for path in Path("board").rglob("*") if path.is_file()], name
+    assert submit("one") == 0
+
+
+def test_a_plan_that_no_physics_follows_is_told(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A policy is judged by what it does, so this is no fault of the score, but readers see it."""
+    plan = Plan.load(finished / "plan.npz")
+    far = plan.states.copy()
+    far[1::2] += 1e6
+    replace(plan, states=far).save(finished / "plan.npz")
+    assert submit("one") == 0
+    assert "seed3: the plan fails its audit (" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -341,7 +395,7 @@ def test_a_claim_that_the_policy_does_not_earn(
         factor = 1.25 if perturbed[name] else 0.0
         score[name] = perturbed[name] = perturbed[name] * factor
     score["against_plan"] *= 1.25
-    (finished / "score.json").write_text(json.dumps(content))
+    (finished / "score.json").write_bytes(encode_json(content))
     assert not contradictions(RunDirectory(finished).record().score, task)
     assert submit("one") == 0
     assert cli.main(["verify", str(ENTRY), "--quick"]) == 0
@@ -584,6 +638,59 @@ def test_the_workflow_that_sees_a_submission_has_no_rights() -> None:
     comments = yaml.safe_load((folder / "submission-comment.yml").read_text())
     assert comments[True]["workflow_run"]["workflows"] == [verifies["name"]]
     assert not any("uses" in step for step in comments["jobs"]["comment"]["steps"])
+
+
+GH = """#!/bin/sh
+echo "$@" >> calls
+case "$*" in
+  *pulls/7/files*) test -z "$BROKEN" || exit 1; cat files ;;
+  *pulls/7\\ *|*pulls/7) cat count ;;
+  *repos/a/b/pulls*) echo 7 ;;
+  *comments*) cp comment.md posted ;;
+esac
+"""
+
+
+@pytest.mark.parametrize(
+    ("files", "count", "found", "posted"),
+    [
+        ("", "8", "verified", "verified"),
+        ("", "8", None, "Not verified: the verifier did not finish, see URL\n"),
+        ("setup.py\n", "8", "evil", "Not verified: a submission only adds files"),
+        ("", "2001", "evil", "Not verified: a submission only adds files"),
+        ("", "", "of another head", None),
+        (None, "8", "evil", None),
+    ],
+)
+def test_the_steps_of_the_comment(
+    tmp_path: Path, files: str | None, count: str, found: str | None, posted: str | None
+) -> None:
+    """Run by bash as GitHub runs them, with a program in the place of `gh` whose filters have
+    been applied. Without `files` it fails to list them."""
+    path = BOARD.parent / ".github" / "workflows" / "submission-comment.yml"
+    find, _, comment = yaml.safe_load(path.read_text())["jobs"]["comment"]["steps"]
+    Path("bin").mkdir()
+    Path("bin/gh").write_text(GH)
+    Path("bin/gh").chmod(0o755)
+    Path("files").write_text(files or "")
+    Path("count").write_text(count)
+    if found is not None:
+        Path("found").mkdir()
+        Path("found/comment.md").write_text(found)
+    given = {"REPOSITORY": "a/b", "HEAD": "c:d", "HEAD_SHA": "e", "RUN_URL": "URL"}
+    paths = {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "GITHUB_OUTPUT": "output"}
+    broken = {"BROKEN": "yes"} if files is None else {}
+    bash = ["bash", "-e", "-c"]
+    done = subprocess.run([*bash, find["run"]], env=given | paths | broken)
+    assert (done.returncode == 0) == (files is not None)
+    output = Path("output").read_text() if Path("output").exists() else ""
+    said = dict(line.split("=") for line in output.splitlines())
+    if "number" in said:
+        values = {"NUMBER": said["number"], "CLEAN": said["clean"]}
+        subprocess.run([*bash, comment["run"]], env=given | paths | values, check=True)
+    assert Path("posted").exists() == (posted is not None)
+    if posted is not None:
+        assert Path("posted").read_text().startswith(posted)
 
 
 def test_a_comment_is_nothing_but_text() -> None:

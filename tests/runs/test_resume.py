@@ -20,8 +20,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.util.tensor_util import make_ndarray
 
-from tsbench import tasks
-from tsbench.cli import verbs
+from tsbench import cli, tasks
 from tsbench.core.errors import Stopped, TsbenchError
 from tsbench.core.motion import ReferenceMotion
 from tsbench.core.policy import Policy
@@ -296,7 +295,7 @@ def test_another_configuration_version_or_task_is_refused(
     path = unfinished / name
     path.write_text(path.read_text().replace(*change, 1))
     before = {path: path.read_bytes() for path in unfinished.rglob("*.*")}
-    assert verbs.main(["run", "resume=run"]) == 2
+    assert cli.main(["run", "resume=run"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("tsbench: ")
     assert line in error
@@ -312,7 +311,7 @@ def test_another_runs_checkpoint_is_refused(
     newest = checkpoints.newest()
     assert newest is not None
     checkpoints.save(1, "imitate", newest.steps + 32, {**newest.content, "run": "another"})
-    assert verbs.main(["run", "resume=run"]) == 2
+    assert cli.main(["run", "resume=run"]) == 2
     assert "is a checkpoint of another run" in capsys.readouterr().err
 
 
@@ -324,7 +323,7 @@ def test_a_checkpoint_with_something_else_in_it_is_refused(
     newest = checkpoints.newest()
     assert newest is not None
     checkpoints.save(1, "imitate", newest.steps + 32, {**newest.content, part: {"steps": 3}})
-    assert verbs.main(["run", "resume=run"]) == 2
+    assert cli.main(["run", "resume=run"]) == 2
     error = capsys.readouterr().err
     assert "checkpoint" in error
     assert error.count("\n") == 1
@@ -341,7 +340,7 @@ def test_a_checkpoint_with_something_else_in_it_is_refused(
 def test_what_cannot_be_resumed(
     words: list[str], line: str, unfinished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert verbs.main(["run", *words]) == 2
+    assert cli.main(["run", *words]) == 2
     assert line in capsys.readouterr().err
 
 
@@ -350,7 +349,7 @@ def test_a_finished_run_is_not_resumed(
 ) -> None:
     shutil.copytree(uninterrupted, tmp_path / "run")
     (tmp_path / "run" / "report.html").touch()
-    assert verbs.main(["run", f"resume={tmp_path / 'run'}"]) == 2
+    assert cli.main(["run", f"resume={tmp_path / 'run'}"]) == 2
     assert capsys.readouterr().err.endswith("a finished run: there is nothing to resume\n")
 
 
@@ -363,7 +362,7 @@ def test_two_at_once_in_a_directory(unfinished: Path, capsys: pytest.CaptureFixt
     holder = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None
     assert holder.stdout.readline() == "locked\n"
-    assert verbs.main(["run", "resume=run"]) == 2
+    assert cli.main(["run", "resume=run"]) == 2
     assert capsys.readouterr().err == "tsbench: another process is at work in run\n"
     holder.kill()
     holder.wait()
@@ -395,13 +394,13 @@ def test_a_signal_saves_the_iteration_and_says_how_to_go_on(
         return step(self, action)
 
     monkeypatch.setattr(BatchedEnvironment, "step", counted)
-    assert verbs.main(["run", *words, "directory=run"]) == status
+    assert cli.main(["run", *words, "directory=run"]) == status
     line = "tsbench: interrupted; to go on: tsbench run resume=run\n"
     assert capsys.readouterr().err == line
     assert (tmp_path / "run" / "metrics.jsonl").read_text().count("\n") == 5
     names = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
     assert names[-1].startswith("01-imitate-000000000064-")
-    assert verbs.main(["run", "resume=run"]) == 0
+    assert cli.main(["run", "resume=run"]) == 0
     assert result(tmp_path / "run") == result(uninterrupted)
     assert {path.name for path in (tmp_path / "run").iterdir()} >= PAGES
 

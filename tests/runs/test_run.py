@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -22,9 +23,8 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.util.tensor_util import make_ndarray
 
-from tsbench import tasks
+from tsbench import cli, tasks
 from tsbench.cli import launch
-from tsbench.cli import verbs as cli
 from tsbench.core import words
 from tsbench.core.errors import PlanError, TsbenchError
 from tsbench.core.motion import ActionLog, Plan, ReferenceMotion
@@ -34,6 +34,7 @@ from tsbench.runs import config
 from tsbench.runs import directory as record
 from tsbench.runs import execute as run
 from tsbench.runs.directory import RunDirectory, Stage
+from tsbench.runs.progress import Output
 from tsbench.runs.workspace import RunWorkspace
 from tsbench.sim.model import compiled_hash, fingerprint
 
@@ -421,6 +422,23 @@ def test_a_full_disk_stops_a_run_in_one_line(size: int, tmp_path: Path) -> None:
     if run.finished:
         assert done.stderr.endswith("its pages are not: tsbench report mine\n")
         assert not run.report_file.exists()
+
+
+def test_a_reader_that_leaves_ends_a_run_with_a_hint(tmp_path: Path) -> None:
+    """As in `tsbench run ... | head -1`."""
+    directory = tmp_path / "mine"
+
+    class Left(io.StringIO):
+        def write(self, text: str) -> int:
+            if RunDirectory(directory).trained:
+                raise BrokenPipeError
+            return super().write(text)
+
+    chosen = replace(config.compose(WORDS), directory=str(directory))
+    with pytest.raises(TsbenchError) as error:
+        run.execute(chosen, WORDS, Output(file=Left()))
+    hint = f"{directory}: Broken pipe; to go on: tsbench run resume={directory}"
+    assert str(error.value) == hint
 
 
 def test_a_run_that_cannot_begin_leaves_nothing(

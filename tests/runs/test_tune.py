@@ -16,8 +16,7 @@ from typing import Any
 
 import pytest
 
-from tsbench import TsbenchError, methods
-from tsbench.cli import verbs
+from tsbench import TsbenchError, cli, methods
 from tsbench.core import plugins
 from tsbench.core.errors import NotFiniteError, PlanError
 from tsbench.runs import config, execute, tune
@@ -312,7 +311,7 @@ def test_what_is_given_is_not_tuned_and_what_cannot_be_tuned_says_so() -> None:
     ],
 )
 def test_wrong_commands(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert verbs.main(["tune", *WORDS, *words]) == 2
+    assert cli.main(["tune", *WORDS, *words]) == 2
     (shown,) = capsys.readouterr().err.splitlines()
     assert line in shown
 
@@ -323,7 +322,7 @@ def test_without_optuna(
     monkeypatch.delitem(sys.modules, "tsbench.runs.tune")
     monkeypatch.delattr("tsbench.runs.tune")
     monkeypatch.setitem(sys.modules, "optuna", None)
-    assert verbs.main(["tune", *WORDS, "trials=1"]) == 2
+    assert cli.main(["tune", *WORDS, "trials=1"]) == 2
     error = capsys.readouterr().err
     assert error == "tsbench: optuna is missing: pip install 'tsbench[tune]'\n"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsbench.cli import verbs
+from tsbench import cli
 from tsbench.core.errors import TsbenchError
 from tsbench.runs.directory import Record, Stage
 from tsbench.runs.results import Curve, Result, Results
@@ -90,10 +90,10 @@ def test_compare_kept_entries(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     words = ["compare", "rocket_navigation/twostage", "rocket_navigation/prm"]
-    assert verbs.main([*words, "--json", "found.json"]) == 0
+    assert cli.main([*words, "--json", "found.json"]) == 0
     text = capsys.readouterr().out
     assert "rocket_navigation, seed by seed" in text
     assert "twostage less prm" in text
     assert (tmp_path / "found.json").exists()
-    assert verbs.main([*words, "--png", "x.png"]) == 2  # entries have no metrics
+    assert cli.main([*words, "--png", "x.png"]) == 2  # entries have no metrics
     assert not (tmp_path / "x.png").exists()

@@ -50,7 +50,7 @@ def test_a_push_stays_in_the_plane_that_scores_push_in() -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "100N", "100@0.5s:+y", "100N@0.5:+y", "100N@0.5s:y", "-1N@0s:+x", "1N@-1s:+x", "1N@0s:+w",
-     "nanN@0s:+x", "1e3N@0s:+x", "1N@0s:+x+y"],
+     f"1N@0s:{'9' * 400}", f"{'9' * 400}N@0s:+x", "nanN@0s:+x", "1e3N@0s:+x", "1N@0s:+x+y"],
 )  # fmt: skip
 def test_what_is_no_push_is_told_what_one_is(text: str) -> None:
     with pytest.raises(TsbenchError, match=r"cannot read the push .*such as 100N@0\.5s:\+x"):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tsbench.cli import verbs
+from tsbench import cli
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import Plan
 from tsbench.runs.directory import RunDirectory
@@ -79,10 +79,10 @@ def test_the_command_writes_it_beside_the_run(
     make_run: MakeRun, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = make_run("rocket_navigation", 0.7)
-    assert verbs.main(["report", str(run)]) == 0
+    assert cli.main(["report", str(run)]) == 0
     assert capsys.readouterr().out == f"{run / 'report.html'}\n"
     assert (run / "report.html").read_text("utf-8").startswith("<!DOCTYPE html>")
-    assert verbs.main(["report", str(run)]) == 2
+    assert cli.main(["report", str(run)]) == 2
     assert "nothing is overwritten: give another by --html FILE" in capsys.readouterr().err
 
 
@@ -92,7 +92,7 @@ def test_what_does_not_belong_to_the_run_is_refused(
     run = make_run("rocket_navigation", 0.7)
     plan = Plan.load(run / "plan.npz")
     replace(plan, task="laikago_trot").save(run / "plan.npz")
-    assert verbs.main(["report", str(run)]) == 2
+    assert cli.main(["report", str(run)]) == 2
     assert "the plan is for laikago_trot version 1, not for" in capsys.readouterr().err
     (run / "metrics.jsonl").write_text('{"stage": "plan", "st')
     with pytest.raises(TsbenchError, match="damaged metrics"):

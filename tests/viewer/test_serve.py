@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -80,6 +82,33 @@ def test_one_page_for_all_who_ask_at_once() -> None:
     assert made == [None]
     assert {status for status, _ in answers} <= {200, 503}
     assert (200, "page") in answers
+
+
+@pytest.mark.parametrize("said", ["", "GET /", "GET / HTTP/1.1\r\nHost: {}\r\n\r\n"])
+def test_a_browser_that_leaves_early(said: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """Before it has asked, or while its page is made: the others are served, nothing is said."""
+    left, asked = threading.Event(), []
+
+    def slowly(push: str | None) -> str:
+        asked.append(push)
+        left.wait(60.0)
+        return "x" * 5_000_000
+
+    with running(slowly) as url:
+        host = url.split("/")[2]
+        name, port = host.split(":")
+        with socket.create_connection((name, int(port))) as connection:
+            connection.sendall(said.format(host).encode())
+            deadline = time.monotonic() + 60.0
+            while said.endswith("\n") and not asked and time.monotonic() < deadline:
+                time.sleep(0.01)
+            # Closed so that the server's next read or write is an error.
+            linger = struct.pack("ii", 1, 0)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        left.set()
+        status, page = fetch(url)
+    assert (status, len(page)) == (200, 5_000_000)
+    assert capfd.readouterr().err == ""
 
 
 def test_closing_waits_for_the_page_in_the_making() -> None:

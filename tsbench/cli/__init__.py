@@ -1,5 +1,5 @@
 """The command line."""
 
-from tsbench.cli.verbs import main
+from tsbench.cli.command import main
 
 __all__ = ["main"]

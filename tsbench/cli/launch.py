@@ -33,6 +33,7 @@ from tsbench.core.lazy import Lazy
 from tsbench.core.words import command
 from tsbench.runs import config
 from tsbench.runs.directory import RunDirectory, shown
+from tsbench.runs.progress import Output
 from tsbench.runs.schema import ELSEWHERE, RunConfig
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def finish(directory: Path, console: Console | None = None) -> None:
     """
     from tsbench.viewer.report import write_pages  # takes a second to load, before a run begins
 
-    finished, console = RunDirectory(directory), console or Console()
+    finished, console = RunDirectory(directory), console or Output()
     record = finished.record()
     tables.show_run(console, record, finished.task(record.task))
     way_on = f"; the run is finished, its pages are not: {command('report', directory)}"

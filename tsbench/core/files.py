@@ -252,9 +252,10 @@ def write_json(path: Path | None, content: Any) -> None:
         TsbenchError: the file exists or cannot be written.
     """
     if path is not None:
-        write_new(path, (_legible(json.dumps(content, indent=2)) + "\n").encode())
+        write_new(path, encode_json(content))
 
 
-def _legible(text: str) -> str:
-    """JSON with every list of plain values on one line."""
-    return re.sub(r"\[[^][{}\"]*\]", lambda found: " ".join(found[0].split()), text)
+def encode_json(content: Any) -> bytes:
+    """The bytes of a JSON file that `write_json` writes: every list of plain values on one line."""
+    text = json.dumps(content, indent=2)
+    return (re.sub(r"\[[^][{}\"]*\]", lambda one: " ".join(one[0].split()), text) + "\n").encode()

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -173,7 +174,7 @@ class Policy:
         content = self._content()
         info = asdict(self.info) | {"sha256": hashlib.sha256(content).hexdigest()}
         write_whole(directory / "policy.safetensors", content)
-        write_whole(directory / "policy.json", (json.dumps(info, indent=2) + "\n").encode())
+        write_whole(directory / "policy.json", encode_info(info))
 
     @classmethod
     def load(cls, directory: Path | str) -> Policy:
@@ -223,6 +224,11 @@ class Policy:
         if np.any(policy.scale <= 0.0):
             raise TsbenchError(f"damaged policy file {path}: the scale must be positive")
         return policy
+
+
+def encode_info(info: Mapping[str, Any]) -> bytes:
+    """The bytes of a `policy.json`."""
+    return (json.dumps(info, indent=2) + "\n").encode()
 
 
 def _read_info(path: Path) -> PolicyInfo:

@@ -56,7 +56,7 @@ def evaluate(
     some = starts.rows(slice(0, protocol.changed))
     nominal = _play(policy, task, task.start(np.random.default_rng(0), 1), here, threads, engine)
     perturbed = _play(policy, task, starts, here, threads, engine)
-    summary = _summary(task, perturbed)
+    summary = summarised(task, perturbed)
     return Score(
         protocol=protocol.name,
         solved_reward=summary.solved_reward,
@@ -64,9 +64,9 @@ def evaluate(
         success=summary.success,
         against_plan=float(perturbed.returns.mean()) / best_return(task),
         perturbed=summary,
-        nominal=_summary(task, nominal),
+        nominal=summarised(task, nominal),
         changes={
-            condition.name: _summary(
+            condition.name: summarised(
                 task,
                 _play(policy, task, some, condition.on(protocol.physics), threads, engine),
             )
@@ -158,7 +158,8 @@ def _play(
     return play(task, physics, policy, count, begin=begin, delay=delay, measure=task.measured)
 
 
-def _summary(task: Task[Any], episodes: Episodes[Any]) -> Summary:
+def summarised(task: Task[Any], episodes: Episodes[Any]) -> Summary:
+    """The means over episodes that were played with `task.measured`."""
     solved = np.asarray(task.success(episodes.final, episodes.course), bool)
     found = task.measures(
         episodes.first, episodes.final, episodes.course, episodes.sums, episodes.lengths

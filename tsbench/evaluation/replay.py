@@ -18,6 +18,7 @@ import numpy as np
 from tsbench.core.motion import ActionLog
 from tsbench.core.state import Start
 from tsbench.core.task import Task
+from tsbench.evaluation.evaluate import summarised
 from tsbench.evaluation.oracle import best_return
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import perturbed_starts
@@ -36,7 +37,8 @@ _IMPULSES = ("impulse_50", "impulse_50_is_lower_bound")
 def replay(task: Task[Any], score: Score, log: ActionLog) -> bool:
     """Whether the logged actions earn the logged rewards again, to within `SAME_REWARD`.
 
-    The first logged episode must also earn the nominal normalized reward of the score.
+    The first logged episode must also have every nominal figure of the score, and the others must
+    be solved where the score says so.
 
     Args:
         task: the task of the score.
@@ -57,11 +59,23 @@ def replay(task: Task[Any], score: Score, log: ActionLog) -> bool:
         episode = _again(task, starts.rows(slice(i, i + 1)), log.actions[:, i : i + 1])
         if not np.allclose(episode.rewards[:, 0], rewards, rtol=SAME_REWARD, atol=0.0):
             return False
-        earned = episode.normalized[0]
-        claimed = score.nominal.normalized_reward
-        if i == 0 and not np.isclose(earned, claimed, rtol=SAME_REWARD, atol=0.0):
+        found = summarised(task, episode)
+        if i == 0 and not _equal(found, score.nominal):
+            return False
+        if i > 0 and found.solved != score.perturbed.solved[i - 1 : i]:
             return False
     return True
+
+
+def _equal(first: Summary, second: Summary) -> bool:
+    """Whether two summaries have the same figures, to within `SAME_REWARD`."""
+    one, other = ({**vars(each), **each.measures} for each in (first, second))
+    numbers = {name for name, value in one.items() if isinstance(value, float)}
+    return all(
+        isinstance(other.get(name), float)
+        and np.isclose(one[name], other[name], rtol=SAME_REWARD, atol=0.0)
+        for name in numbers
+    ) and all(one[name] == other.get(name) for name in one.keys() - numbers - {"measures"})
 
 
 def _again(task: Task[Any], start: Start, actions: np.ndarray) -> Episodes[Any]:
@@ -69,7 +83,7 @@ def _again(task: Task[Any], start: Start, actions: np.ndarray) -> Episodes[Any]:
     physics: Physics[Any] = Physics(task, 1)
     following = iter(actions)
     begin = physics.place(np.arange(1), start)
-    return play(task, physics, lambda _: next(following), 1, begin=begin)
+    return play(task, physics, lambda _: next(following), 1, begin=begin, measure=task.measured)
 
 
 @dataclass(frozen=True)
@@ -229,10 +243,20 @@ def _impossible(summary: Summary, episodes: int, task: Task[Any]) -> list[str]:
         found.append(f"{summary.episodes} episodes, not {episodes}")
     if not 0.0 < summary.steps <= task.horizon:
         found.append(f"{summary.steps:.4g} steps of {task.horizon}")
+    for name in ("violations", "steps"):
+        total = getattr(summary, name) * summary.episodes
+        if not np.isclose(total, round(total), rtol=1e-12, atol=1e-9):
+            found.append(f"{name} is no mean of {summary.episodes} counts")
     if not abs(summary.normalized_reward) <= 1.0:
         found.append("normalized_reward is beyond 1")
     if summary.success == 0.0 and summary.solved_reward != 0.0:
         found.append("solved_reward without a solved episode")
+    if summary.success == 1.0 and summary.solved_reward != summary.normalized_reward:
+        found.append("solved_reward is not normalized_reward, though every episode was solved")
+    if abs(summary.solved_reward) > summary.success + 1e-12:
+        found.append("solved_reward is larger than success")
+    if not summary.goal_distance >= 0.0:
+        found.append("goal_distance is negative")
     if set(summary.measures) != set(task.measure_notes):
         found.append("the measures are not the task's")
     return found

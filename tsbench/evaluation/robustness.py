@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,6 +41,8 @@ class Surface:
         for name in ("survived", "recovered"):
             if np.shape(getattr(self, name)) != shape:
                 raise ValueError(f"{name} does not fit forces_N, headings_rad and phases")
+        if not all(abs(heading) <= 2.0 * math.pi for heading in self.headings_rad):
+            raise ValueError("headings_rad must lie within a turn")
         if np.any(np.greater(self.recovered, self.survived)):
             raise ValueError("recovered must not hold where survived does not")
 

@@ -24,7 +24,14 @@ from tsbench.evaluation.references import stored
 from tsbench.evaluation.statistics import Aggregate, aggregate
 from tsbench.evaluation.words import FIGURES
 from tsbench.leaderboard.submission import MANIFEST, Entry, read_entry
-from tsbench.leaderboard.verify import RETRACTED, STATES, as_markdown, entries, recorded
+from tsbench.leaderboard.verify import (
+    CLAIMS,
+    RETRACTED,
+    STATES,
+    as_markdown,
+    entries,
+    recorded,
+)
 from tsbench.runs.directory import RunDirectory
 
 Report = Callable[[RunDirectory], str]  # makes the page of a training: 3-D view and figures
@@ -65,6 +72,11 @@ class Row:
     @property
     def name(self) -> str:
         return self.entry.manifest.described.entry
+
+    @property
+    def claims(self) -> str:
+        """What nobody has verified, in words."""
+        return CLAIMS[self.state]
 
     @property
     def complete(self) -> bool:
@@ -273,8 +285,13 @@ def _templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.filters |= {"number": number, "short": short, "duration": duration}
+    templates.filters |= {"number": number, "short": short, "duration": duration, "soft": _soft}
     style = importlib.resources.files("tsbench.leaderboard").joinpath("templates/style.css")
     templates.globals["starts"] = V1.perturbed
     templates.globals["style"] = style.read_text("utf-8")
     return templates
+
+
+def _soft(name: str) -> str:
+    """A name that a browser may break after its underscores."""
+    return name.replace("_", "_\u200b")

@@ -39,6 +39,7 @@ from tsbench.evaluation.evaluate import check_fit
 from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.replay import contradictions
 from tsbench.evaluation.score import Score
+from tsbench.leaderboard import coherence
 from tsbench.runs import directory
 from tsbench.runs.directory import Record, RunDirectory, Stage
 from tsbench.runs.schema import SEEDS
@@ -432,6 +433,7 @@ def _read_training(run: RunDirectory, training: Training, manifest: Manifest) ->
         )
     if wrong := contradictions(record.score, task):
         raise TsbenchError(f"{run.score_file} contradicts itself: {'; '.join(wrong)}")
+    coherence.check(run, record, task)
     if run.has_metrics and directory.thin_metrics(run.metrics_file) != read_file(
         run.metrics_file, directory.MAX_CURVES
     ):
@@ -452,8 +454,12 @@ def _check_agreement(
         ("task", [manifest.task, info.task, record.task, score.origin.task]),
         (
             "version of the task",
-            [manifest.task_version, info.task_version, record.task_version,
-             score.origin.task_version],
+            [
+                manifest.task_version,
+                info.task_version,
+                record.task_version,
+                score.origin.task_version,
+            ],
         ),
         ("protocol", [manifest.protocol, score.protocol, score.origin.protocol.name]),
         ("method", [manifest.method, info.method, record.method]),
@@ -462,8 +468,12 @@ def _check_agreement(
         ("policy", [info.sha256, score.origin.policy]),
         ("score", [training.claimed, Claim.of(score)]),
         ("cost", [cost(training), cost_of(record)]),
-        ("versions", [training.versions, _packages(versions) if versions else training.versions]),
-    ]  # fmt: skip
+    ]
+    if versions:
+        said += [
+            ("versions", [training.versions, _packages(versions)]),
+            ("commit", [training.code, versions.get("commit")]),
+        ]
     config = run.config() if run.config_file.exists() else None
     if config is not None:
         said += [

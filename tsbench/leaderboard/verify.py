@@ -42,6 +42,18 @@ from tsbench.runs.schema import RunConfig
 
 STATES = ("submitted", "replayed", "re-scored", "hidden-seed", "re-trained")
 RETRACTED = "retracted"
+# What a state leaves unproved, for readers. No state proves what nobody can see from files.
+UNPROVED = (
+    "hardware, seconds, learning curves, tuning trials, and which seeds were trained but not kept"
+)
+CLAIMS = {
+    "submitted": f"every figure, the command, seeds, settings and steps, {UNPROVED}",
+    "replayed": "every figure but those of the nominal episode, "
+    f"the command, seeds, settings and steps, {UNPROVED}",
+    "re-scored": f"that the command, seed, settings and steps made this policy, {UNPROVED}",
+    "hidden-seed": f"that the command, seed, settings and steps made this policy, {UNPROVED}",
+    "re-trained": UNPROVED,
+}
 MAX_VERDICT = 512 * 2**10  # bytes
 SEED_DIGITS = 32  # hexadecimal: a hash of fewer could be searched for
 # Standard errors by which a score on the hidden seed may lie below that on the published one. A

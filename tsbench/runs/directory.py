@@ -178,16 +178,23 @@ class RunDirectory:
 
     def config(self) -> RunConfig:
         """The configuration of the run."""
+        try:
+            config: RunConfig = typed(RunConfig, self.settings(), "")
+        except TsbenchError as error:
+            if str(self.config_file) in str(error):
+                raise
+            raise TsbenchError(f"damaged configuration {self.config_file}: {error}") from None
+        return config
+
+    def settings(self) -> Any:
+        """The plain values of the configuration, which `config` gives their types."""
         path = self.config_file
         content = read_file(path, MAX_CONFIG, "configuration")
         try:
-            config: RunConfig = typed(RunConfig, _plain_yaml(content), "")
+            return _plain_yaml(content)
         except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date such as 2026-99-99
             reason = " ".join(str(error).split())
             raise TsbenchError(f"damaged configuration {path}: {reason}") from None
-        except TsbenchError as error:
-            raise TsbenchError(f"damaged configuration {path}: {error}") from None
-        return config
 
     @property
     def command(self) -> str:

@@ -42,7 +42,7 @@ from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
 from tsbench.runs import events
 from tsbench.runs.directory import Record, RunDirectory
-from tsbench.runs.progress import progress_bar
+from tsbench.runs.progress import Output, progress_bar
 from tsbench.runs.provenance import check_provenance, identity, write_provenance
 from tsbench.runs.schema import RunConfig
 from tsbench.runs.workspace import RunWorkspace
@@ -98,7 +98,7 @@ def execute(config: RunConfig, words: Sequence[str] = (), console: Console | Non
         try:
             write_provenance(run, config, problem, words)
             line = f"{command('run', *words)} -> {run.path}"
-            return _work(config, problem, run, line, console or Console())
+            return _work(config, problem, run, line, console or Output())
         except (TsbenchError, OSError) as error:
             if not run.trained and not isinstance(error, (NotFiniteError, PlanError)):
                 _leave_as_found(run.path, found)
@@ -147,7 +147,7 @@ def resume(directory: Path, console: Console | None = None) -> Score:
                 for path, _ in leftovers(folder) if folder.is_dir() else ():
                     path.unlink(missing_ok=True)
             line = command("run", f"resume={directory}")
-            return _work(config, problem, run, line, console or Console())
+            return _work(config, problem, run, line, console or Output())
 
 
 def complete(config: RunConfig, words: Sequence[str] = ()) -> float:

@@ -1,12 +1,22 @@
-"""A progress bar on a terminal."""
+"""The output of a run, and a progress bar on a terminal."""
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+
+class Output(Console):
+    """A console on which a reader that has left is an error like any other of the system, where
+    rich would end the process without a word of how to resume the run."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 import shutil
 import subprocess
@@ -14,8 +13,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from tsbench import methods, tasks
 from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError
@@ -24,6 +21,7 @@ from tsbench.core.method import Problem
 from tsbench.core.words import command
 from tsbench.rl import processes
 from tsbench.rl.devices import CPU, described
+from tsbench.runs import schema
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.schema import RunConfig
 from tsbench.sim.model import compiled_hash
@@ -68,8 +66,7 @@ def write_provenance(
     }
     run.versions_file.unlink(missing_ok=True)
     write_json(run.versions_file, versions)
-    content = yaml.safe_dump(asdict(config), sort_keys=False)
-    write_whole(run.config_file, f"# {command('run', *words)}\n{content}".encode())
+    write_whole(run.config_file, schema.encode(asdict(config), command("run", *words)))
 
 
 def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
@@ -81,7 +78,6 @@ def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     code = hashlib.sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
         code.update(path.read_bytes())
-    configuration = json.dumps(config.identity, sort_keys=True)
     brought = {tasks.provider(problem.task.name), methods.provider(config.method["name"])}
     foreign = sorted(one for one in brought if one not in (None, plugins.own()))
     where: dict[str, Any] = {}
@@ -90,7 +86,7 @@ def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     if processes.count() > 1:
         where["processes"] = processes.count()
     return {
-        "configuration": hashlib.sha256(configuration.encode()).hexdigest(),
+        "configuration": schema.identity_hash(asdict(config)),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
         "code": code.hexdigest(),

@@ -5,7 +5,10 @@ Hydra is not imported here: it composes configurations (`runs.config`), and take
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -95,7 +98,7 @@ class RunConfig:
     @property
     def identity(self) -> dict[str, Any]:
         """The part of the configuration that determines a run's results."""
-        return {name: value for name, value in asdict(self).items() if name not in ELSEWHERE}
+        return identity(asdict(self))
 
     def __post_init__(self) -> None:
         if not isinstance(self.method.get("name"), str):
@@ -112,6 +115,25 @@ class RunConfig:
             raise TsbenchError("deterministic: true is for a GPU; on the CPU every run is")
         if self.budget not in self.task.budgets:
             raise unknown("budget", self.budget, self.task.budgets)
+
+
+def identity(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a configuration's values that determines a run's results."""
+    return {name: value for name, value in values.items() if name not in ELSEWHERE}
+
+
+def identity_hash(values: Mapping[str, Any]) -> str:
+    """sha256 of `identity`, by which `versions.json` names the configuration.
+
+    Raises:
+        TypeError: JSON does not have a value.
+    """
+    return hashlib.sha256(json.dumps(identity(values), sort_keys=True).encode()).hexdigest()
+
+
+def encode(values: Mapping[str, Any], command: str) -> bytes:
+    """The bytes of `config.yaml`: the command on the first line, then the values."""
+    return f"# {command}\n{yaml.safe_dump(dict(values), sort_keys=False)}".encode()
 
 
 def names(group: str) -> tuple[str, ...]:

@@ -9,12 +9,13 @@ which names the site that the browser believes it talks to, and by Sec-Fetch-Sit
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 from tsbench.core.errors import TsbenchError
@@ -76,12 +77,11 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
 
         def _answer(self, status: HTTPStatus, kind: str, text: str) -> None:
             content = text.encode()
-            with suppress(ConnectionError):  # the browser has left
-                self.send_response(status)
-                self.send_header("Content-Type", f"{kind}; charset=utf-8")
-                self.send_header("Content-Length", str(len(content)))
-                self.end_headers()
-                self.wfile.write(content)
+            self.send_response(status)
+            self.send_header("Content-Type", f"{kind}; charset=utf-8")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
 
         def log_message(self, *_: object) -> None:
             """Logs nothing, to keep the user's terminal free."""
@@ -92,6 +92,10 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
             a thread of it renders ends by a segmentation fault."""
             super().server_close()
             rendering.acquire()
+
+        def handle_error(self, request: Any, client_address: Any) -> None:
+            if not isinstance(sys.exception(), ConnectionError):  # the browser has left
+                super().handle_error(request, client_address)
 
     try:
         listening = Server((HOST, port), Handler)

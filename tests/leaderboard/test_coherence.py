@@ -1,0 +1,150 @@
+"""Whether the files in which a run tells of its own training contradict each other."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tsbench.core.errors import TsbenchError
+from tsbench.core.files import encode_json
+from tsbench.leaderboard import coherence
+from tsbench.runs.directory import RunDirectory
+from tsbench.runs.schema import encode, identity_hash
+
+BOARD = Path(__file__).parents[2] / "leaderboards"
+KEPT = sorted(path.parent for path in BOARD.glob("v1/*/*/seed*/config.yaml"))
+ROCKET = BOARD / "v1" / "rocket_obstacles" / "twostage" / "seed0"
+Change = Callable[[RunDirectory], object]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunDirectory:
+    shutil.copytree(ROCKET, tmp_path / "seed0")
+    return RunDirectory(tmp_path / "seed0")
+
+
+def check(run: RunDirectory) -> None:
+    record = run.record()
+    coherence.check(run, record, run.task(record.task))
+
+
+def text(name: str, before: str, after: str) -> Change:
+    def change(run: RunDirectory) -> None:
+        file = run.path / name
+        assert before in file.read_text()
+        file.write_text(file.read_text().replace(before, after, 1))
+
+    return change
+
+
+def versions(**changes: Any) -> Change:
+    """Other values of versions.json, or none for a value of None."""
+
+    def change(run: RunDirectory) -> None:
+        values = {**run.versions(), **changes}
+        for name in [name for name, value in changes.items() if value is ...]:
+            del values[name]
+        run.versions_file.write_bytes(encode_json(values))
+
+    return change
+
+
+def hashed(change: Change) -> Change:
+    """Another configuration, for which versions.json is then written."""
+
+    def changed(run: RunDirectory) -> None:
+        change(run)
+        versions(configuration=identity_hash(run.settings()))(run)
+
+    return changed
+
+
+def command(words: str) -> Change:
+    return lambda run: run.config_file.write_bytes(encode(run.settings(), words))
+
+
+def stage(**changes: Any) -> Change:
+    def change(run: RunDirectory) -> None:
+        content = json.loads(run.score_file.read_text())
+        content["stages"][1] |= changes
+        run.score_file.write_bytes(encode_json(content))
+
+    return change
+
+
+@pytest.mark.parametrize("path", KEPT, ids=lambda path: "-".join(path.parts[-3:]))
+def test_what_tsbench_has_written_is_coherent(path: Path) -> None:
+    check(RunDirectory(path))
+
+
+@pytest.mark.parametrize(
+    ("change", "file", "fault"),
+    [
+        # One file changed alone.
+        (
+            text("config.yaml", "act: 4000000", "act: 4000001"),
+            "versions.json",
+            "the hash of another",
+        ),
+        (
+            text("config.yaml", "discount: 0.9", "discount: 0.8"),
+            "versions.json",
+            "the hash of another",
+        ),
+        (versions(configuration="0" * 64), "versions.json", "the hash of another"),
+        (text("config.yaml", "rollout: 16", "rollout: 2026-01-01"), "versions.json", "of another"),
+        (versions(code="0" * 63), "versions.json", "code cannot be '0000"),
+        (versions(code=None), "versions.json", "code cannot be None"),
+        (versions(commit="main"), "versions.json", "commit cannot be 'main'"),
+        (versions(python="three"), "versions.json", "python cannot be 'three'"),
+        (versions(platform=""), "versions.json", "platform cannot be ''"),
+        (versions(platform="\x1b[2J"), "versions.json", "platform cannot be"),
+        (versions(packages={"mujoco": 3}), "versions.json", "packages cannot be"),
+        (versions(physics={"rocket_obstacles": "0" * 64}), "versions.json", "not the model of"),
+        (versions(physics={}), "versions.json", "not the model of rocket_obstacles"),
+        (versions(device={"gpu": "H100"}), "versions.json", "names a device"),
+        (versions(processes=1), "versions.json", "processes cannot be 1"),
+        (versions(platform=...), "versions.json", "it has no platform"),
+        (versions(note="hello"), "versions.json", "a key 'note'"),
+        (stage(physics_substeps=5), "score.json", "5 physics steps in 4,001,792 steps"),
+        (stage(seconds=-1.0), "score.json", "negative"),
+        (stage(warnings={"x": -1}), "score.json", "negative"),
+        # Text that no reader sees.
+        (text("config.yaml", "\ntask:", "\n# tuned on the test\ntask:"), "config.yaml", "written"),
+        (text("config.yaml", "constants: {}", "constants: { }"), "config.yaml", "written"),
+        (text("versions.json", '"code": ', '"code":  '), "versions.json", "not written as"),
+        (text("policy.json", '"task": ', '"task":  '), "policy.json", "not written as"),
+        (text("score.json", '"standard": ', '"standard":\t'), "score.json", "not written as"),
+        # Two files that fit, and a command that asks for something else.
+        (hashed(text("config.yaml", "seed: 0", "seed: 1")), "config.yaml", "says 'seed=0', the"),
+        (hashed(text("config.yaml", "discount: 0.999", "discount: 0.9")), "", ""),
+        (command("tsbench run method=prm"), "config.yaml", "'method=prm', the value is 'twostage'"),
+        (command("tsbench run task.budgets.paper.act=5_000_000"), "config.yaml", "is 4000000"),
+        (command("tsbench run method.plans=3"), "config.yaml", "there is no such value"),
+        (command("rm -rf /"), "config.yaml", "no command of tsbench run: 'rm -rf /'"),
+        (command("tsbench run 'seed=0"), "config.yaml", "its first line is no command"),
+        # Words that cannot be judged, or that change no result.
+        (command("tsbench run 'method.plans=[1, 2]' threads=7 hydra.verbose=true"), "", ""),
+        (command("tsbench run seed=0 task.budgets.paper.act=4e6 +seed=0"), "", ""),
+    ],
+)
+def test_a_contradiction_is_told(run: RunDirectory, change: Change, file: str, fault: str) -> None:
+    change(run)
+    if not fault:
+        check(run)
+        return
+    with pytest.raises(TsbenchError) as error:
+        check(run)
+    assert str(error.value).startswith(str(run.path / file))
+    assert fault in str(error.value)
+
+
+def test_a_run_without_a_configuration_is_coherent(run: RunDirectory) -> None:
+    run.config_file.unlink()
+    run.versions_file.unlink()
+    check(run)

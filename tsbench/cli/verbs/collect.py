@@ -1,0 +1,29 @@
+"""`tsbench collect`: keep the scores, curves and best policies of many runs as data."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from tsbench.cli import places
+from tsbench.cli.arguments import verb_parser, whole_number
+
+
+def call(words: Sequence[str]) -> None:
+    parser = verb_parser("collect", json=False)
+    what = "runs, entries, results folders, or folders with such in them"
+    parser.add_argument("runs", nargs="+", type=places.path, metavar="RUNS", help=what)
+    out = "the results folder, which is made where there is none"
+    parser.add_argument("--out", type=places.path, required=True, metavar="DIR", help=out)
+    trials = "trials that were spent on tuning the settings of these runs"
+    parser.add_argument("--trials", type=_trials, metavar="N", help=trials)
+    options = parser.parse_args(words)
+    from tsbench.runs import results
+
+    found = results.read(options.runs)
+    kept = results.collect(found, options.out, options.trials)
+    sys.stdout.write(f"{options.out}: {len(found.rows)} added, {len(kept.rows)} in all\n")
+
+
+def _trials(word: str) -> int:
+    return whole_number(word, 0, 10**6)

@@ -1,0 +1,23 @@
+"""`tsbench describe`: show a task's card: spaces, reward, constants, what was reached."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from tsbench.cli.arguments import verb_parser
+
+
+def call(words: Sequence[str]) -> None:
+    parser = verb_parser("describe")
+    parser.add_argument("task", metavar="TASK", help="its name, which `tsbench list` gives")
+    show_card(parser.parse_args(words))
+
+
+def show_card(options: Any) -> None:
+    from rich.console import Console
+
+    from tsbench.cli import describe
+    from tsbench.core.files import write_json
+
+    write_json(options.json, describe.show(Console(), options.task.removeprefix("task=")))
