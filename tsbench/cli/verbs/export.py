@@ -14,7 +14,7 @@ from tsbench.core.errors import TsbenchError
 def call(words: Sequence[str]) -> None:
     parser = verb_parser("export", json=False)
     what = "a run or policy directory, TASK/ENTRY, .onnx, stable-baselines3 .zip, or .pt of torch"
-    parser.add_argument("model", type=places.run, metavar="MODEL", help=what)
+    parser.add_argument("model", metavar="MODEL", help=what)
     for_task = "that the policy is for, if it does not say so"
     parser.add_argument("task", nargs="?", metavar="task=NAME", help=for_task)
     parser.add_argument("directory", type=places.path, metavar="DIRECTORY", help="a new one")
@@ -28,6 +28,7 @@ def call(words: Sequence[str]) -> None:
     from tsbench.evaluation import deploy, export
 
     check_new(options.directory, parents=True)
+    options.model = places.run(options.model)
     if not (options.model.exists() or options.model.is_symlink()):
         raise TsbenchError(f"no model {options.model}: there is no such file or directory")
     if options.activation is not None and options.model.suffix not in (".pt", ".pth"):
