@@ -39,6 +39,12 @@ def verb_parser(verb: str, *, json: bool = True) -> Parser:
     return parser
 
 
+def add_runs(parser: Parser) -> None:
+    """Adds the words that `results.read` takes, as `runs`."""
+    what = "runs, entries, results folders, or folders with such in them"
+    parser.add_argument("runs", nargs="+", type=places.path, metavar="RUNS", help=what)
+
+
 def new_file(word: str) -> Path:
     """The path of a new file, checked before hours of work whose result it will hold.
 

@@ -6,13 +6,12 @@ import sys
 from collections.abc import Sequence
 
 from tsbench.cli import places
-from tsbench.cli.arguments import verb_parser, whole_number
+from tsbench.cli.arguments import add_runs, verb_parser, whole_number
 
 
 def call(words: Sequence[str]) -> None:
     parser = verb_parser("collect", json=False)
-    what = "runs, entries, results folders, or folders with such in them"
-    parser.add_argument("runs", nargs="+", type=places.path, metavar="RUNS", help=what)
+    add_runs(parser)
     out = "the results folder, which is made where there is none"
     parser.add_argument("--out", type=places.path, required=True, metavar="DIR", help=out)
     trials = "trials that were spent on tuning the settings of these runs"

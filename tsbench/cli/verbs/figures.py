@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tsbench.cli import places
-from tsbench.cli.arguments import verb_parser
+from tsbench.cli.arguments import add_runs, verb_parser
 
 
 def call(words: Sequence[str]) -> None:
     parser = verb_parser("figures", json=False)
-    what = "runs, entries, results folders, or folders with such in them"
-    parser.add_argument("runs", nargs="+", type=places.path, metavar="RUNS", help=what)
+    add_runs(parser)
     out = "a new folder, which gets index.html and the figures as PNG, SVG and CSV"
     parser.add_argument("--out", type=places.path, required=True, metavar="DIR", help=out)
     options = parser.parse_args(words)
