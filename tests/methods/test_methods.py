@@ -19,11 +19,13 @@ from tsbench.core.policy import Policy, PolicyInfo
 from tsbench.core.task import plannable
 from tsbench.evaluation.evaluate import check_fit
 from tsbench.methods import twostage
+from tsbench.rl import stages
 from tsbench.rl.stages import settings
 from tsbench.runs.config import compose
 from tsbench.runs.execute import prepare
 from tsbench.sim.kinematic import Planning
 from tsbench.sim.tracking import Imitation
+from tsbench.tasks.laikago import Laikago
 from tsbench.testing import MethodContract
 from tsbench.testing.contracts import Desk, bits
 from tsbench.testing.episodes import plannable_tasks
@@ -116,6 +118,25 @@ def test_finetuning(tmp_path: Path) -> None:
     assert desk.substeps["finetune"] == 64 * 20
 
 
+def test_stages_after_the_imitation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first still earns the imitation's reward, the second the task's own, and each goes on
+    with the policy of the one before."""
+    seen: list[tuple[type, Any]] = []
+
+    def learn(*given: Any) -> Any:
+        seen.append((type(given[3]), given[6] if len(given) > 6 else None))
+        learners.append(original(*given))
+        return learners[-1]
+
+    learners: list[Any] = []
+    original = stages.learn_physics
+    monkeypatch.setattr(stages, "learn_physics", learn)
+    desk = Desk(tmp_path)
+    twostage.train(problem("laikago_walk", settle=0.25, finetune=0.25), desk)
+    assert desk.stages == [("plan", 192), ("imitate", 64), ("settle", 32), ("finetune", 32)]
+    assert seen == [(Imitation, None), (Imitation, learners[0]), (Laikago, learners[1])]
+
+
 def test_a_failed_audit_stops_the_run(tmp_path: Path) -> None:
     """The plan of 192 steps does not arrive, so the run stops before physics, unless it is told to
     go on or the budget is too small for any plan."""
@@ -169,6 +190,8 @@ def test_the_plan_is_one_deterministic_episode() -> None:
         ("twostage", {"finetun": 0.1}, r"unknown key in method 'finetun'.*did you mean 'finetune'"),
         ("twostage", {"finetune": 1.0}, r"method.finetune must lie in \[0, 1\)"),
         ("twostage", {"finetune": "half"}, r"method.finetune must be a number"),
+        ("twostage", {"settle": -0.1}, r"method.settle must lie in \[0, 1\)"),
+        ("prm", {"settle": 0.5, "finetune": 0.5}, r"settle and finetune must leave a share"),
         ("twostage", {"audit": "skip"}, r"method.audit must be stop, warn or null, not skip"),
         ("twostage", {"explore": -0.1}, r"method.explore must lie in \[0, 1\]"),
         ("twostage", {"imitation": "papr"}, r"'papr'.*allowed: paper, progress"),

@@ -17,10 +17,10 @@ from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable, roadmap_space
 from tsbench.methods import options
 from tsbench.planning.roadmap import cycled, find_route
-from tsbench.rl.stages import ImitationOptions, learn_imitation
+from tsbench.rl.stages import AFTER_IMITATION, ImitationOptions, learn_imitation
 from tsbench.sim.kinematic import plan_along, rolled_out
 
-STAGES = ("imitate", "finetune")
+STAGES = ("imitate", *AFTER_IMITATION)
 ROADMAPS = ("blind", "layered")
 
 

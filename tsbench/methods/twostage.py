@@ -2,8 +2,8 @@
 
 Stage one learns on the planning variant by PPO; the deterministic rollout of its policy is the
 plan. The plan is turned into a reference motion and audited. Stage two learns to imitate the
-reference motion by PPO. A third stage, off by default, fine-tunes the imitation policy on the
-task's own reward.
+reference motion by PPO. Two more stages are off by default: `settle` goes on imitating with other
+settings, and `finetune` goes on with the task's own reward.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from tsbench.core.motion import Plan
 from tsbench.core.policy import Policy
 from tsbench.core.task import plannable
 from tsbench.methods import options
-from tsbench.rl.stages import ImitationOptions, learn_imitation, learn_planning
+from tsbench.rl.stages import AFTER_IMITATION, ImitationOptions, learn_imitation, learn_planning
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.kinematic import Planning
 
-STAGES = ("plan", "imitate", "finetune")
+STAGES = ("plan", "imitate", *AFTER_IMITATION)
 
 
 @dataclass(frozen=True)

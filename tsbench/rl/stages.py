@@ -28,6 +28,8 @@ from tsbench.sim.tracking import Imitation
 
 Environment = BatchedEnvironment[Any] | DeviceEnvironment[Any]
 
+AFTER_IMITATION = ("settle", "finetune")  # stages that may follow `imitate`, in this order
+
 
 @dataclass(frozen=True)
 class StageSettings(PPOSettings):
@@ -41,9 +43,9 @@ class StageSettings(PPOSettings):
 def settings(problem: Problem, kind: str) -> StageSettings:
     """The settings of a kind of stage.
 
-    Kinds are the names that methods give in their `STAGES`. Two have rules of their own: `plan` has
-    no physics that could be disturbed, and `finetune` begins with the settings of `imitate`. Off
-    the CPU and in several processes `update: auto` is rsl-rl's own update.
+    Kinds are the names that methods give in their `STAGES`. Three have rules of their own: `plan`
+    has no physics that could be disturbed, and `settle` and `finetune` begin with the settings of
+    `imitate`. Off the CPU and in several processes `update: auto` is rsl-rl's own update.
 
     Raises:
         TsbenchError: unknown names or values of the wrong type or range.
@@ -71,12 +73,12 @@ def settings(problem: Problem, kind: str) -> StageSettings:
 
 
 def _changes(problem: Problem, kind: str) -> dict[str, Any]:
-    """The settings that differ from the defaults. `finetune` continues with the imitation stage's
-    policy, so its settings are changes to those of `imitate`. Its pushes start at full size, which
-    those of the imitation stage have reached."""
+    """The settings that differ from the defaults. The stages after `imitate` continue with its
+    policy, so their settings are changes to those of `imitate`. Their pushes start at full size,
+    which those of the imitation stage have reached."""
     given, path = problem.training.get(kind, {}), f"task.training.{kind}"
     changes = typed_items(StageSettings, given, path)
-    if kind != "finetune":
+    if kind not in AFTER_IMITATION:
         return changes
     before = _changes(problem, "imitate")
     other = typed_items(Disturbances, given.get("disturb", {}), f"{path}.disturb")
@@ -173,18 +175,24 @@ class ImitationOptions:
 
     Attributes:
         imitation: form of the imitation reward, None for the task's default.
+        settle: share of the physics budget spent on further imitation with the settings of
+            `settle`, such as milder disturbances.
         finetune: share of the physics budget spent on the task's own reward at the end.
         audit: what a plan that fails its audit does: "stop" ends the run, "warn" goes on; None for
             what the budget says.
     """
 
     imitation: str | None = None
+    settle: float = 0.0
     finetune: float = 0.0
     audit: str | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.finetune < 1.0:
-            raise ValueError(f"finetune must lie in [0, 1), not {self.finetune}")
+        for name in AFTER_IMITATION:
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must lie in [0, 1), not {getattr(self, name)}")
+        if self.settle + self.finetune >= 1.0:
+            raise ValueError("settle and finetune must leave a share of the budget to imitate with")
         if self.audit not in (None, *AUDITS):
             raise ValueError(f"audit must be stop, warn or null, not {self.audit}")
 
@@ -204,13 +212,15 @@ def learn_imitation(
     reference = task.reference(plan)
     reference.save(workspace.directory / "reference.npz")
     _audit(problem, workspace, plan, reference, options.audit or problem.budget.audit)
-    finetuning = round(options.finetune * act)
     imitation = Imitation(task, reference, options.imitation)
-    learner = learn_physics(problem, workspace, "imitate", imitation, "imitate", act - finetuning)
-    if finetuning:
-        learner = learn_physics(
-            problem, workspace, "finetune", task, "finetune", finetuning, start_from=learner
-        )
+    settling, finetuning = round(options.settle * act), round(options.finetune * act)
+    learner = learn_physics(
+        problem, workspace, "imitate", imitation, "imitate", act - settling - finetuning
+    )
+    further = (("settle", imitation, settling), ("finetune", task, finetuning))
+    for name, mdp, steps in further:
+        if steps:
+            learner = learn_physics(problem, workspace, name, mdp, name, steps, learner)
     return learner
 
 

@@ -30,7 +30,7 @@ words, in Hydra's grammar:
                    words
   method.KEY=...   an option of the method
   task.training.STAGE.KEY=...
-                   a PPO setting of the plan, imitate, finetune or task stages
+                   a PPO setting of the plan, imitate, settle, finetune or task stages
   task.constants.KEY=...
                    a constant of the task, for studies: such a score is not ranked
 
