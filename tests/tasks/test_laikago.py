@@ -336,8 +336,25 @@ def course(stance: float, swing: float, violated: bool = False, walked: float = 
     ],
 )
 def test_success(base_x: float, at: LaikagoCourse, solved: bool) -> None:
-    there = state(base=(base_x, 0.0, 0.42))
+    there = state(base=(base_x, 0.0, 0.42), time=2.0)
     assert make("laikago_walk").success(there, at).tolist() == [solved]
+
+
+@pytest.mark.parametrize(
+    ("name", "distance", "steps", "solved"),
+    [
+        ("laikago_walk", 1.25, 47, False),  # two cycles of 0.8 s are 48 control steps
+        ("laikago_walk", 1.25, 48, True),
+        ("laikago_trot", 3.0, 31, False),  # two cycles of 0.533 s are 32
+        ("laikago_trot", 3.0, 32, True),
+        ("laikago_walk", 0.2, 10, False),  # 0.1 m at 0.264 m/s are 11.4 steps
+        ("laikago_walk", 0.2, 11, True),
+    ],
+)
+def test_a_lunge_is_not_a_gait(name: str, distance: float, steps: int, solved: bool) -> None:
+    there = state(base=(distance, 0.0, 0.42), time=steps / 30)
+    task = make(name, distance=distance)
+    assert task.success(there, course(1.0, 1.0)).tolist() == [solved]
 
 
 @pytest.mark.parametrize(
