@@ -22,7 +22,7 @@ from rich.console import Console
 from tsbench import cli, tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import encode_json
-from tsbench.core.motion import Plan
+from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.evaluation import protocol as protocols
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import PROTOCOLS, SMOKE, V1
@@ -35,6 +35,7 @@ from tsbench.runs.schema import identity_hash
 
 BOARD = Path(__file__).parents[2] / "leaderboards"
 KEPT = sorted(path.parent for path in BOARD.glob("v1/*/*/manifest.json"))
+IDS = [f"{entry.parent.name}-{entry.name}" for entry in KEPT]
 WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512", "seed=3"]
 WHO = ["--author", "A. Person", "--licence", "MIT", "--board", "board"]
 TOLD = ["--seeds", "5", "--steps", "256", "--seconds", "1.5", "--command", "python train.py"]
@@ -355,6 +356,31 @@ def test_a_plan_that_no_physics_follows_is_told(
     assert "seed3: the plan fails its audit (" in capsys.readouterr().out
 
 
+def test_a_reference_motion_that_never_moves_is_told(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By each verb that reads it. To evaluate a policy nobody reads it."""
+    motion = ReferenceMotion.load(finished / "reference.npz")
+    frozen = np.repeat(motion.qpos[:1], len(motion.qpos), axis=0)
+    replace(motion, qpos=frozen, qvel=0.0 * motion.qvel).save(finished / "reference.npz")
+    assert submit("one") == 0
+    line = "distance of the reference motion from the plan: "
+    assert line in capsys.readouterr().out
+    assert cli.main(["verify", str(ENTRY), "--quick"]) == 0
+    assert line in capsys.readouterr().out
+    distance = tasks.make("rocket_navigation").goal_distance
+    start = float(distance(tasks.make("rocket_navigation").ideal())[0])
+    told = f"The plan starts {start:.2f} m from the goal and ends {start:.2f} m from it"
+    for verb in ("view", "report"):
+        assert cli.main([verb, str(ENTRY / "seed3"), "--html", f"{verb}.html"]) == 0
+        assert told in Path(f"{verb}.html").read_text()
+    assert line.rstrip(": ") in Path("report.html").read_text()
+    shutil.rmtree(ENTRY)
+    (finished / "plan.npz").unlink()
+    assert submit("one") == 0
+    assert "nobody can audit the reference motion without plan.npz" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -492,31 +518,29 @@ def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]
     assert "without a plan" in Path("report.html").read_text()
 
 
-def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
-    """200 random bytes, over all files of an entry."""
+@pytest.mark.parametrize("entry", KEPT, ids=IDS)
+def test_every_flipped_byte_is_noticed(entry: Path, tmp_path: Path) -> None:
+    """200 random bytes, over all files of an entry. The message names the file."""
     rng = np.random.default_rng(0)
-    runs = [path.parent for path in BOARD.glob("v1/*/*/*/score.json")]
-    run = min(runs, key=lambda run: sum(file.stat().st_size for file in run.iterdir()))
-    described = Described("mine", ("A. Person",), "MIT")
-    packed = submission.pack([run], described, tmp_path, V1, score=evaluate)
-    files = sorted(path for path in packed.rglob("*") if path.is_file())
-    submission.read_entry(packed)
-    noticed = set()
+    copy = tmp_path / entry.parent.name / entry.name
+    shutil.copytree(entry, copy)
+    files = sorted(path for path in copy.rglob("*") if path.is_file())
+    submission.read_entry(copy)
+    noticed = 0
     for number in range(200):
         file = files[number % len(files)]
         content = file.read_bytes()
-        place = int(rng.integers(len(content)))
         changed = bytearray(content)
-        changed[place] ^= int(rng.integers(1, 256))
+        changed[int(rng.integers(len(content)))] ^= int(rng.integers(1, 256))
         file.write_bytes(changed)
-        with pytest.raises(TsbenchError, match=file.name):
-            submission.read_entry(packed)
-        noticed.add(number)
+        with pytest.raises(TsbenchError, match=str(file.relative_to(copy))):
+            submission.read_entry(copy)
+        noticed += 1
         file.write_bytes(content)
-    assert len(noticed) == 200
+    assert noticed == 200
 
 
-@pytest.mark.parametrize("entry", KEPT, ids=[f"{one.parent.name}-{one.name}" for one in KEPT])
+@pytest.mark.parametrize("entry", KEPT, ids=IDS)
 def test_the_entries_of_the_repository(entry: Path) -> None:
     verdict = verify.verify(entry, verify.Asked(rescore=False, threads=1))
     assert verdict.passed, verdict.reasons

@@ -347,7 +347,9 @@ def _files(path: Path) -> set[str]:
     Raises:
         TsbenchError: there is no such directory, or something in it that no entry has.
     """
-    if path.is_symlink() or not path.is_dir():
+    if path.is_symlink():
+        raise TsbenchError(f"{path} is a link: name the entry itself")
+    if not path.is_dir():
         raise TsbenchError(f"no entry {path}")
     found, total = set(), 0
     for folder, name in _listed(path):
@@ -517,6 +519,9 @@ def _remarks(run: RunDirectory, task: Task[Any]) -> Iterator[str]:
     run.roadmap(task)
     plan, reference = run.plan(task), run.reference(task)
     if plan is None or reference is None:
+        for lone, lacking in ((plan, run.reference_file), (reference, run.plan_file)):
+            if lone is not None:
+                yield f"{run.path.name}: nobody can audit the {lone.kind} without {lacking.name}"
         return
     failures = plannable(task).audit(plan, reference).failures
     if failures:
