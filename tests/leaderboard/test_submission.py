@@ -249,6 +249,16 @@ def test_a_score_by_another_protocol_is_made_again(
     assert submission.read_entry(ENTRY).kept[0].record.score == score
 
 
+def bare(name: str) -> Callable[[Path], object]:
+    """Leaves what another library's training might: no configuration, and not the file."""
+
+    def spoil(run: Path) -> None:
+        for one in ("config.yaml", "versions.json", name):
+            (run / one).unlink()
+
+    return spoil
+
+
 def plan_of_another_task(run: Path) -> None:
     plan = Plan.load(run / "plan.npz")
     replace(plan, task="rocket_obstacles").save(run / "plan.npz")
@@ -289,9 +299,11 @@ def plan_of_another_task(run: Path) -> None:
             lambda run: other_score(run, "score", "robustness", "survival_100N", value=0.123),
             "contradicts itself: survival_100N is not that of the surface",
         ),
-        (lambda run: (run / "actions.npz").unlink(), "files lacks seed3/actions.npz"),
-        (lambda run: (run / "policy.json").unlink(), "an action log alone is no entry"),
-        (lambda run: (run / "score.json").unlink(), "say --seeds, --steps, --seconds"),
+        (lambda run: (run / "actions.npz").unlink(), "one has no actions.npz: --rescore makes it"),
+        (lambda run: (run / "policy.json").unlink(), "tsbench run resume=one"),
+        (lambda run: (run / "score.json").unlink(), "is not finished: tsbench run resume=one"),
+        (bare("policy.json"), "an action log alone is no entry"),
+        (bare("score.json"), "of a policy that tsbench did not train say --seeds, --steps"),
     ],
 )
 def test_what_does_not_belong_together_is_no_entry(
@@ -305,6 +317,7 @@ def test_what_does_not_belong_together_is_no_entry(
     error = capsys.readouterr().err
     assert line in error
     assert error.count("\n") == 1
+    assert ".submit-" not in error
     assert not list(Path("board").iterdir())
 
 
@@ -402,7 +415,7 @@ def test_runs_of_several_kinds_are_no_entry(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert submit("one", "one") == 2
-    assert "two of the runs have the same seed" in capsys.readouterr().err
+    assert "two of the runs have the same seed, 3: an entry keeps" in capsys.readouterr().err
     second = seeded(finished, 4)
     other_score(second, "budget", value="fast")
     assert submit("one", str(second)) == 2
