@@ -429,6 +429,8 @@ SCORE: dict[str, list[Any]] = {
     "score/origin/protocol/seed": [1, 2**63], "score/origin/protocol/perturbed": [10],
     "score/origin/protocol/tolerance": [10.0], "score/origin/protocol/ranked": [False],
     "score/origin/protocol/forces": [[1.0] * 200_000], "score/origin/policy": ["0" * 64, None],
+    "score/origin/constants": ["0" * 63, "x" * 64], "score/origin/mjcf": [""],
+    "score/origin/model": ["G" * 64],
     "score/origin/task": ["cooking"], "score/origin/packages": [[], {"mujoco": 3}],
     "score/origin/machine": [None], "more": [1],
 }  # fmt: skip
