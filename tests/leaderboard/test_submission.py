@@ -422,6 +422,56 @@ def test_runs_of_several_kinds_are_no_entry(
     assert "more than one budget: fast, smoke" in capsys.readouterr().err
 
 
+MADE = "an entry is what tsbench submit has made of runs, unchanged"
+OTHERS = "move it there, or submit its runs by another name"
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "line"),
+    [
+        ("rocket_navigation/yours", None, f"holds the entry rocket_navigation/mine: {OTHERS}"),
+        ("rocket_obstacles/mine", None, f"holds the entry rocket_navigation/mine: {OTHERS}"),
+        ("rocket_navigation/mine", "seed3/plan.npz", f"seed3/plan.npz is missing: {MADE}"),
+        (
+            "rocket_navigation/mine",
+            "manifest.json",
+            f"is no entry, it has no manifest.json: {MADE}",
+        ),
+        ("rocket_navigation/mine", "seed3/report.html", "is no file of an entry: remove it"),
+        ("rocket_navigation/mine", "README.md", "is no file of an entry: remove it"),
+    ],
+)
+def test_an_entry_that_was_moved_or_changed(
+    finished: Path, capsys: pytest.CaptureFixture[str], place: str, change: str | None, line: str
+) -> None:
+    """By hand. A file that is there is removed, another is added."""
+    described = Described("mine", ("A. Person",), "MIT")
+    packed = submission.pack([finished], described, Path("board"), QUICK, score=evaluate)
+    entry = Path("copy") / place
+    shutil.copytree(packed, entry)
+    if change is not None:
+        file = entry / change
+        file.unlink() if file.exists() else file.write_text("mine")
+    assert cli.main(["verify", str(entry), "--quick"]) == 1
+    refused = capsys.readouterr().out.splitlines()
+    assert refused[1:] == [next(one for one in refused[1:] if one.endswith(line))]
+
+
+def test_directories_that_are_no_entry_or_no_run(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert submit("one") == 0
+    for place in ("one", str(ENTRY / "seed3"), str(ENTRY.parent)):
+        assert cli.main(["verify", place, "--quick"]) == 1
+        assert f"{place} is no entry, it has no manifest.json: {MADE}" in capsys.readouterr().out
+    assert submit(str(ENTRY), "--check") == 2
+    assert f"name the trainings in it, {ENTRY / 'seed*'}" in capsys.readouterr().err
+    assert submit("one/score.json", "--check") == 2
+    assert "no run directory one/score.json" in capsys.readouterr().err
+    assert submit("one", "--check") == 2
+    assert "mine exists and nothing is overwritten: give another --name" in capsys.readouterr().err
+
+
 def test_a_claim_that_the_policy_does_not_earn(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
