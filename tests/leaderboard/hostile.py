@@ -57,9 +57,9 @@ class HangError(Exception):
 
 
 def intact(folder: Path) -> Path:
-    """An entry made of the smallest kept run that has a plan and a roadmap, with every file that
-    an entry may have."""
-    runs = [path.parent for path in BOARD.glob("v1/*/*/*/roadmap.npz")]
+    """An entry made of the smallest kept run of seed 0 that has a plan and a roadmap, with every
+    file that an entry may have."""
+    runs = [path.parent for path in BOARD.glob("v1/*/*/seed0/roadmap.npz")]
     kept = min(runs, key=lambda run: sum(file.stat().st_size for file in run.iterdir()))
     run = folder / "run"
     shutil.copytree(kept, run)
