@@ -57,9 +57,14 @@ class HangError(Exception):
 
 
 def intact(folder: Path) -> Path:
-    """An entry made of the smallest kept run that has a plan."""
-    runs = [path.parent for path in BOARD.glob("v1/*/*/*/plan.npz")]
-    run = min(runs, key=lambda run: sum(file.stat().st_size for file in run.iterdir()))
+    """An entry made of the smallest kept run of seed 0 that has a plan and a roadmap, with every
+    file that an entry may have."""
+    runs = [path.parent for path in BOARD.glob("v1/*/*/seed0/roadmap.npz")]
+    kept = min(runs, key=lambda run: sum(file.stat().st_size for file in run.iterdir()))
+    run = folder / "run"
+    shutil.copytree(kept, run)
+    row = {"stage": "plan", "steps": 1, "seconds": 1.0, "episode_return": 1.0}
+    (run / "metrics.jsonl").write_text(f"{json.dumps(row)}\n")
     described = submission.Described(
         "entry", ("A. Person",), "MIT", "https://example.org", "a PC", 0
     )
@@ -316,7 +321,9 @@ NPZS: dict[str, bytes | Callable[[bytes], bytes]] = {
     "a time step of text": with_arrays(timestep=np.array("0.1")),
     "a version that is no number": with_arrays(task_version=np.array(1.0)),
 }
-ARRAYS = {"plan.npz": "states", "reference.npz": "qpos", "actions.npz": "actions"}
+ARRAYS = {
+    "plan.npz": "states", "reference.npz": "qpos", "actions.npz": "actions", "roadmap.npz": "nodes",
+}  # fmt: skip
 RESHAPED = {
     "values that are not finite": lambda array: np.full(array.shape, np.inf),
     "float32": lambda array: array.astype(np.float32),
@@ -429,6 +436,8 @@ SCORE: dict[str, list[Any]] = {
     "score/origin/protocol/seed": [1, 2**63], "score/origin/protocol/perturbed": [10],
     "score/origin/protocol/tolerance": [10.0], "score/origin/protocol/ranked": [False],
     "score/origin/protocol/forces": [[1.0] * 200_000], "score/origin/policy": ["0" * 64, None],
+    "score/origin/constants": ["0" * 63, "x" * 64], "score/origin/mjcf": [""],
+    "score/origin/model": ["G" * 64],
     "score/origin/task": ["cooking"], "score/origin/packages": [[], {"mujoco": 3}],
     "score/origin/machine": [None], "more": [1],
 }  # fmt: skip
@@ -552,18 +561,21 @@ def linked_training(folder: Path) -> None:
 
 READ_BY = {
     "evaluate": ("policy.json", "policy.safetensors", "config.yaml", "score.json", "actions.npz"),
-    "view": ("policy.json", "policy.safetensors", "config.yaml", "score.json", "reference.npz"),
+    "view": (
+        "policy.json", "policy.safetensors", "config.yaml", "score.json", "reference.npz",
+        "roadmap.npz",
+    ),
     "report": (
         "policy.json", "policy.safetensors", "config.yaml", "score.json", "reference.npz",
-        "plan.npz", "metrics.jsonl",
+        "plan.npz", "roadmap.npz", "metrics.jsonl",
     ),
     "resume": ("config.yaml", "versions.json"),
     "submit": ("policy.json", "policy.safetensors", "config.yaml", "score.json", "actions.npz",
-               "versions.json", "plan.npz", "reference.npz", "metrics.jsonl"),
+               "versions.json", "plan.npz", "reference.npz", "roadmap.npz", "metrics.jsonl"),
 }  # fmt: skip
 ABSENT = {  # whose absence is no fault
     ("gone", name) for name in ("config.yaml", "actions.npz", "plan.npz", "reference.npz",
-                                "metrics.jsonl", "versions.json", "score.json")
+                                "roadmap.npz", "metrics.jsonl", "versions.json", "score.json")
 }  # fmt: skip
 
 
@@ -670,8 +682,6 @@ def entries(folder: Path) -> None:
 
 def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> None:
     whole = intact(folder / "whole") / "seed0"
-    row = {"stage": "plan", "steps": 1, "seconds": 1.0, "episode_return": 1.0}
-    (whole / "metrics.jsonl").write_text(f"{json.dumps(row)}\n")
     found = run_cases([chosen] if chosen else [*READ_BY], only is None)
     if only in ("scores", "edges"):
         edges = {place: values[-1:] for place, values in EDGES.items()}

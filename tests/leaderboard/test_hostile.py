@@ -57,14 +57,14 @@ def test_a_refusal_names_the_file(entries: list[dict[str, Any]]) -> None:
 
 def test_random_changes_of_an_entry() -> None:
     """A change that the manifest does not know of is always noticed. With a manifest that fits, a
-    hash or a platform may be another one of the same form, and so may the origin of a score and
-    what an archive's directory says beside its members: the first is believed, the second is
-    refused when the actions are replayed, the third is read by nobody."""
+    hash, a platform or a figure of a learning curve may be another one of the same form, and so may
+    the origin of a score and what an archive's directory says beside its members: the first are
+    claims, the second is refused when the actions are replayed, the third is read by nobody."""
     found = cases("fuzz", "200", "--start", "1000000")
     assert len(found) > 150
     for case in found:
         _, _, file, *signed = case["case"].split()
-        told = file.endswith(("versions.json", "score.json", ".npz"))
+        told = file.endswith(("versions.json", "score.json", ".npz", "metrics.jsonl"))
         if not (case["accepted"] and told and signed):
             check_refused(case)
     assert sum(case["accepted"] for case in found) <= 3

@@ -115,6 +115,14 @@ def test_texts_of_an_entry_are_nothing_but_text(site: Path) -> None:
     assert submission.Manifest.decode(manifest).described.entry == "ten"
 
 
+def test_the_guide_leaves_the_same_claims_as_an_entry_s_page() -> None:
+    """Every state, in order, in the words of the page."""
+    guide = (BOARD.parent / "docs" / "leaderboard.md").read_text()
+    _, _, after = guide.partition("## What stays a claim")
+    rows = re.findall(r"^\| (.+) \| (.+) \|$", after.partition("\n## ")[0], re.MULTILINE)
+    assert rows[1:] == [(state, verify.CLAIMS[state]) for state in verify.STATES]
+
+
 @pytest.mark.parametrize("width", [1280, 500])
 def test_nothing_runs_off_the_screen(site: Path, width: int, tmp_path: Path) -> None:
     """500 px are the narrowest window that Chromium opens."""

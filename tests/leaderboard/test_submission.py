@@ -22,7 +22,7 @@ from rich.console import Console
 from tsbench import cli, tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import encode_json
-from tsbench.core.motion import Plan
+from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.evaluation import protocol as protocols
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import PROTOCOLS, SMOKE, V1
@@ -35,6 +35,7 @@ from tsbench.runs.schema import identity_hash
 
 BOARD = Path(__file__).parents[2] / "leaderboards"
 KEPT = sorted(path.parent for path in BOARD.glob("v1/*/*/manifest.json"))
+IDS = [f"{entry.parent.name}-{entry.name}" for entry in KEPT]
 WORDS = ["task=rocket_navigation", "budget=smoke", "task.budgets.smoke.plan=512", "seed=3"]
 WHO = ["--author", "A. Person", "--licence", "MIT", "--board", "board"]
 TOLD = ["--seeds", "5", "--steps", "256", "--seconds", "1.5", "--command", "python train.py"]
@@ -248,6 +249,16 @@ def test_a_score_by_another_protocol_is_made_again(
     assert submission.read_entry(ENTRY).kept[0].record.score == score
 
 
+def bare(name: str) -> Callable[[Path], object]:
+    """Leaves what another library's training might: no configuration, and not the file."""
+
+    def spoil(run: Path) -> None:
+        for one in ("config.yaml", "versions.json", name):
+            (run / one).unlink()
+
+    return spoil
+
+
 def plan_of_another_task(run: Path) -> None:
     plan = Plan.load(run / "plan.npz")
     replace(plan, task="rocket_obstacles").save(run / "plan.npz")
@@ -288,9 +299,11 @@ def plan_of_another_task(run: Path) -> None:
             lambda run: other_score(run, "score", "robustness", "survival_100N", value=0.123),
             "contradicts itself: survival_100N is not that of the surface",
         ),
-        (lambda run: (run / "actions.npz").unlink(), "files lacks seed3/actions.npz"),
-        (lambda run: (run / "policy.json").unlink(), "an action log alone is no entry"),
-        (lambda run: (run / "score.json").unlink(), "say --seeds, --steps, --seconds"),
+        (lambda run: (run / "actions.npz").unlink(), "one has no actions.npz: --rescore makes it"),
+        (lambda run: (run / "policy.json").unlink(), "tsbench run resume=one"),
+        (lambda run: (run / "score.json").unlink(), "is not finished: tsbench run resume=one"),
+        (bare("policy.json"), "an action log alone is no entry"),
+        (bare("score.json"), "of a policy that tsbench did not train say --seeds, --steps"),
     ],
 )
 def test_what_does_not_belong_together_is_no_entry(
@@ -304,6 +317,7 @@ def test_what_does_not_belong_together_is_no_entry(
     error = capsys.readouterr().err
     assert line in error
     assert error.count("\n") == 1
+    assert ".submit-" not in error
     assert not list(Path("board").iterdir())
 
 
@@ -355,6 +369,31 @@ def test_a_plan_that_no_physics_follows_is_told(
     assert "seed3: the plan fails its audit (" in capsys.readouterr().out
 
 
+def test_a_reference_motion_that_never_moves_is_told(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By each verb that reads it. To evaluate a policy nobody reads it."""
+    motion = ReferenceMotion.load(finished / "reference.npz")
+    frozen = np.repeat(motion.qpos[:1], len(motion.qpos), axis=0)
+    replace(motion, qpos=frozen, qvel=0.0 * motion.qvel).save(finished / "reference.npz")
+    assert submit("one") == 0
+    line = "distance of the reference motion from the plan: "
+    assert line in capsys.readouterr().out
+    assert cli.main(["verify", str(ENTRY), "--quick"]) == 0
+    assert line in capsys.readouterr().out
+    distance = tasks.make("rocket_navigation").goal_distance
+    start = float(distance(tasks.make("rocket_navigation").ideal())[0])
+    told = f"The plan starts {start:.2f} m from the goal and ends {start:.2f} m from it"
+    for verb in ("view", "report"):
+        assert cli.main([verb, str(ENTRY / "seed3"), "--html", f"{verb}.html"]) == 0
+        assert told in Path(f"{verb}.html").read_text()
+    assert line.rstrip(": ") in Path("report.html").read_text()
+    shutil.rmtree(ENTRY)
+    (finished / "plan.npz").unlink()
+    assert submit("one") == 0
+    assert "nobody can audit the reference motion without plan.npz" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -376,11 +415,61 @@ def test_runs_of_several_kinds_are_no_entry(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert submit("one", "one") == 2
-    assert "two of the runs have the same seed" in capsys.readouterr().err
+    assert "two of the runs have the same seed, 3: an entry keeps" in capsys.readouterr().err
     second = seeded(finished, 4)
     other_score(second, "budget", value="fast")
     assert submit("one", str(second)) == 2
     assert "more than one budget: fast, smoke" in capsys.readouterr().err
+
+
+MADE = "an entry is what tsbench submit has made of runs, unchanged"
+OTHERS = "move it there, or submit its runs by another name"
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "line"),
+    [
+        ("rocket_navigation/yours", None, f"holds the entry rocket_navigation/mine: {OTHERS}"),
+        ("rocket_obstacles/mine", None, f"holds the entry rocket_navigation/mine: {OTHERS}"),
+        ("rocket_navigation/mine", "seed3/plan.npz", f"seed3/plan.npz is missing: {MADE}"),
+        (
+            "rocket_navigation/mine",
+            "manifest.json",
+            f"is no entry, it has no manifest.json: {MADE}",
+        ),
+        ("rocket_navigation/mine", "seed3/report.html", "is no file of an entry: remove it"),
+        ("rocket_navigation/mine", "README.md", "is no file of an entry: remove it"),
+    ],
+)
+def test_an_entry_that_was_moved_or_changed(
+    finished: Path, capsys: pytest.CaptureFixture[str], place: str, change: str | None, line: str
+) -> None:
+    """By hand. A file that is there is removed, another is added."""
+    described = Described("mine", ("A. Person",), "MIT")
+    packed = submission.pack([finished], described, Path("board"), QUICK, score=evaluate)
+    entry = Path("copy") / place
+    shutil.copytree(packed, entry)
+    if change is not None:
+        file = entry / change
+        file.unlink() if file.exists() else file.write_text("mine")
+    assert cli.main(["verify", str(entry), "--quick"]) == 1
+    refused = capsys.readouterr().out.splitlines()
+    assert refused[1:] == [next(one for one in refused[1:] if one.endswith(line))]
+
+
+def test_directories_that_are_no_entry_or_no_run(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert submit("one") == 0
+    for place in ("one", str(ENTRY / "seed3"), str(ENTRY.parent)):
+        assert cli.main(["verify", place, "--quick"]) == 1
+        assert f"{place} is no entry, it has no manifest.json: {MADE}" in capsys.readouterr().out
+    assert submit(str(ENTRY), "--check") == 2
+    assert f"name the trainings in it, {ENTRY / 'seed*'}" in capsys.readouterr().err
+    assert submit("one/score.json", "--check") == 2
+    assert "no run directory one/score.json" in capsys.readouterr().err
+    assert submit("one", "--check") == 2
+    assert "mine exists and nothing is overwritten: give another --name" in capsys.readouterr().err
 
 
 def test_a_claim_that_the_policy_does_not_earn(
@@ -492,31 +581,29 @@ def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]
     assert "without a plan" in Path("report.html").read_text()
 
 
-def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
-    """200 random bytes, over all files of an entry."""
+@pytest.mark.parametrize("entry", KEPT, ids=IDS)
+def test_every_flipped_byte_is_noticed(entry: Path, tmp_path: Path) -> None:
+    """200 random bytes, over all files of an entry. The message names the file."""
     rng = np.random.default_rng(0)
-    runs = [path.parent for path in BOARD.glob("v1/*/*/*/score.json")]
-    run = min(runs, key=lambda run: sum(file.stat().st_size for file in run.iterdir()))
-    described = Described("mine", ("A. Person",), "MIT")
-    packed = submission.pack([run], described, tmp_path, V1, score=evaluate)
-    files = sorted(path for path in packed.rglob("*") if path.is_file())
-    submission.read_entry(packed)
-    noticed = set()
+    copy = tmp_path / entry.parent.name / entry.name
+    shutil.copytree(entry, copy)
+    files = sorted(path for path in copy.rglob("*") if path.is_file())
+    submission.read_entry(copy)
+    noticed = 0
     for number in range(200):
         file = files[number % len(files)]
         content = file.read_bytes()
-        place = int(rng.integers(len(content)))
         changed = bytearray(content)
-        changed[place] ^= int(rng.integers(1, 256))
+        changed[int(rng.integers(len(content)))] ^= int(rng.integers(1, 256))
         file.write_bytes(changed)
-        with pytest.raises(TsbenchError, match=file.name):
-            submission.read_entry(packed)
-        noticed.add(number)
+        with pytest.raises(TsbenchError, match=str(file.relative_to(copy))):
+            submission.read_entry(copy)
+        noticed += 1
         file.write_bytes(content)
-    assert len(noticed) == 200
+    assert noticed == 200
 
 
-@pytest.mark.parametrize("entry", KEPT, ids=[f"{one.parent.name}-{one.name}" for one in KEPT])
+@pytest.mark.parametrize("entry", KEPT, ids=IDS)
 def test_the_entries_of_the_repository(entry: Path) -> None:
     verdict = verify.verify(entry, verify.Asked(rescore=False, threads=1))
     assert verdict.passed, verdict.reasons

@@ -258,6 +258,101 @@ def test_nothing_is_left_of_what_was_half_written(unfinished: Path) -> None:
     assert not (unfinished / "checkpoints").exists()
 
 
+def outside(name: str, content: bytes | None = None) -> Path:
+    """A file of the user's in another directory, or with no content a folder of such files, among
+    them what a run would remove from its own folder."""
+    place = Path("elsewhere") / name
+    place.parent.mkdir(exist_ok=True)
+    if content is not None:
+        place.write_bytes(content)
+        return place.absolute()
+    place.mkdir()
+    half = f".policy.json.{'0' * 32}.part"
+    for inner in ("events.out.tfevents.1.mine", half, "thesis.tex"):
+        (place / inner).write_text("mine")
+    (place / "photos").mkdir()
+    (place / "photos" / "cat.jpg").write_text("mine")
+    return place.absolute()
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "line"),
+    [
+        *((name, "link", "is a link") for name in (
+            "log.txt", "metrics.jsonl", "versions.json", "config.yaml", "score.json",
+            "failure.txt",
+        )),
+        *((name, "hard link", "has a second name") for name in ("log.txt", "metrics.jsonl")),
+        *((name, "folder", "is a link") for name in (
+            "tensorboard", "checkpoints", "mlflow", "wandb",
+        )),
+    ],
+)  # fmt: skip
+def test_no_run_goes_on_through_links(
+    name: str,
+    kind: str,
+    line: str,
+    unfinished: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Whoever sends a run could else let files be changed or removed that lie elsewhere."""
+    place = unfinished / name
+    if kind == "folder":
+        theirs = outside(name)
+        if place.exists():
+            shutil.copytree(place, theirs, dirs_exist_ok=True)
+            shutil.rmtree(place)
+    else:
+        theirs = outside(name, place.read_bytes() if place.exists() else b"mine")
+        place.unlink(missing_ok=True)
+    if kind == "hard link":
+        os.link(theirs, place)
+    else:
+        place.symlink_to(theirs)
+    before = contents(Path("elsewhere"))
+    assert cli.main(["run", "resume=run"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("tsbench: ")
+    assert f"run/{name} {line}" in error
+    assert error.count("\n") == 1
+    assert contents(Path("elsewhere")) == before
+
+
+def test_what_a_resumed_run_replaces_is_not_followed(
+    unfinished: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Links in the places of files that it writes anew, and under the names that temporary files
+    once had, to files of the user's."""
+    names = ["plan.npz", "reference.npz", "policy.json", "policy.safetensors", "actions.npz"]
+    parts = [f"{name}.part" for name in [*names, "report.html", "config.yaml", "score.json"]]
+    for name in [*names, *parts]:
+        (unfinished / name).unlink(missing_ok=True)
+        (unfinished / name).symlink_to(outside(name, b"mine"))
+    before = contents(Path("elsewhere"))
+    assert cli.main(["run", "resume=run"]) == 0
+    assert contents(Path("elsewhere")) == before
+    assert all((unfinished / name).is_symlink() for name in parts)
+    for name in parts:
+        (unfinished / name).unlink()
+    assert result(unfinished) == result(uninterrupted)
+    # A link in the place of a page is refused, once the run is finished.
+    (unfinished / "report.html").unlink()
+    (unfinished / "report.html").symlink_to(Path("elsewhere/report.html").absolute())
+    capsys.readouterr()
+    assert cli.main(["run", "resume=run"]) == 2
+    error = capsys.readouterr().err
+    assert "report.html exists and nothing is overwritten" in error
+    assert error.count("\n") == 1
+    assert contents(Path("elsewhere")) == before
+
+
 def test_the_log_and_the_score_tell_of_the_interruption(unfinished: Path) -> None:
     before = json.loads((unfinished / "metrics.jsonl").read_text().splitlines()[-1])
     with (unfinished / "metrics.jsonl").open("a") as file:

@@ -333,6 +333,46 @@ def test_a_run_that_cannot_begin_leaves_what_was_there(
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["movie.part"]
 
 
+@pytest.mark.parametrize("what", ["full", "nothing", "itself", "file"])
+def test_a_run_begins_in_no_place_that_a_link_makes_unusable(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files where the link leads stay as they are."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "itself").symlink_to("itself")
+    (tmp_path / "mine").symlink_to(what)
+    words = ["run", "task=rocket_navigation", "budget=smoke", "directory=mine"]
+    assert cli.main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("tsbench: mine")
+    assert error.count("\n") == 1
+    found = {path.name for path in tmp_path.rglob("*")}
+    assert found == {"full", "thesis.tex", "file", "itself", "mine"}
+    assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_run_begins_beside_links_without_following_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a run left before it began may be replaced, and not what a link in its place is to."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "elsewhere" / "versions.json").write_text("mine")
+    (tmp_path / "mine" / "versions.json").symlink_to(tmp_path / "elsewhere" / "versions.json")
+    (tmp_path / "mine" / "config.yaml").symlink_to(tmp_path / "elsewhere" / "config.yaml")
+    words = ["run", "task=rocket_navigation", "budget=smoke", "directory=mine", "threads=1"]
+    tiny = ["task.budgets.smoke.plan=96", "task.budgets.smoke.act=128"]
+    assert cli.main([*words, *tiny, "task.constants.distance=6.0"]) == 0
+    assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["versions.json"]
+    assert (tmp_path / "elsewhere" / "versions.json").read_text() == "mine"
+    assert not (tmp_path / "mine" / "config.yaml").is_symlink()
+
+
 def test_a_run_in_json(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -136,19 +136,24 @@ def check_plain(value: Any, depth: int = 0, *, finite: bool = True) -> None:
 
 
 def append(path: Path) -> BinaryIO:
-    """Opens a regular file for writing at its end, a new one if there is none. No link is followed.
+    """Opens a regular file for writing at its end, a new one if there is none. No link is followed,
+    and no file is written that has a second name, perhaps in another directory.
 
     Raises:
-        TsbenchError: the file cannot be opened, or is not a regular one.
+        TsbenchError: the file cannot be opened, is not a regular one, or has a second name.
     """
     flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
     if path.is_symlink():
         raise TsbenchError(f"{path} is a link: nothing is written through it")
     with os_errors(path):
         file = os.fdopen(os.open(path, flags, 0o666), "ab")
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+    status = os.fstat(file.fileno())
+    if not stat.S_ISREG(status.st_mode):
         file.close()
         raise TsbenchError(f"{path} is not a regular file")
+    if status.st_nlink > 1:
+        file.close()
+        raise TsbenchError(f"{path} has a second name (a hard link): put a copy in its place")
     return file
 
 

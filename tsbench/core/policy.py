@@ -133,9 +133,9 @@ class Policy:
         an action must not depend on the other rows of the batch.
         """
         activation = ACTIVATIONS[self.info.activation]
-        encoded = ENCODINGS[self.info.encoding](np.asarray(observation, np.float32))
         # Numbers that overflow end an episode (`sim.dynamics.expect_finite`), without a warning.
         with np.errstate(over="ignore", invalid="ignore"):
+            encoded = ENCODINGS[self.info.encoding](np.asarray(observation, np.float32))
             x = (encoded - self.mean) / self.scale
             if self.info.bound is not None:
                 x = np.clip(x, -self.info.bound, self.info.bound)

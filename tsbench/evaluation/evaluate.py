@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from tsbench.core.errors import TsbenchError
+from tsbench.core.errors import NotFiniteError, TsbenchError
 from tsbench.core.motion import ActionLog
 from tsbench.core.policy import Policy
 from tsbench.core.state import Start
@@ -45,18 +46,28 @@ def evaluate(
 
     Raises:
         TsbenchError: the policy was trained for another task, version or physics.
+        NotFiniteError: a number in action, state or reward is not finite. The message says in which
+            part of the protocol.
     """
     if isinstance(policy, Policy):
         check_fit(policy, task)
     origin = Origin.here(task, protocol, policy)
     if progress is not None:
         policy = _watched(policy, task, protocol, progress)
-    here = Condition(protocol.name, protocol.physics)
+    here = Condition("unchanged physics", protocol.physics)
     starts = perturbed_starts(task, protocol)
     some = starts.rows(slice(0, protocol.changed))
     nominal = _play(policy, task, task.start(np.random.default_rng(0), 1), here, threads, engine)
     perturbed = _play(policy, task, starts, here, threads, engine)
     summary = summarised(task, perturbed)
+    changes = {
+        condition.name: summarised(
+            task, _play(policy, task, some, condition.on(protocol.physics), threads, engine)
+        )
+        for condition in protocol.conditions
+    }
+    with _told("pushed"):
+        pushes = robustness(policy, task, protocol, threads, engine)
     return Score(
         protocol=protocol.name,
         solved_reward=summary.solved_reward,
@@ -65,14 +76,8 @@ def evaluate(
         against_plan=float(perturbed.returns.mean()) / best_return(task),
         perturbed=summary,
         nominal=summarised(task, nominal),
-        changes={
-            condition.name: summarised(
-                task,
-                _play(policy, task, some, condition.on(protocol.physics), threads, engine),
-            )
-            for condition in protocol.conditions
-        },
-        robustness=robustness(policy, task, protocol, threads, engine),
+        changes=changes,
+        robustness=pushes,
         origin=origin,
         log=ActionLog(
             task=task.name,
@@ -89,7 +94,7 @@ def solved_rewards(
 ) -> np.ndarray:
     """The normalized reward of each perturbed episode, zero where it was not solved, shape (n,).
     `Score.solved_reward` is their mean."""
-    here = Condition(protocol.name, protocol.physics)
+    here = Condition("unchanged physics", protocol.physics)
     episodes = _play(policy, task, perturbed_starts(task, protocol), here, threads, Physics)
     rewards: np.ndarray = episodes.normalized * task.success(episodes.final, episodes.course)
     return rewards
@@ -155,7 +160,17 @@ def _play(
     physics = engine(task, count, threads=threads, change=condition.change)
     begin = physics.place(np.arange(count), starts)
     delay = condition.delay
-    return play(task, physics, policy, count, begin=begin, delay=delay, measure=task.measured)
+    with _told(condition.name):
+        return play(task, physics, policy, count, begin=begin, delay=delay, measure=task.measured)
+
+
+@contextmanager
+def _told(part: str) -> Iterator[None]:
+    """Says of a number that is not finite in which part of a protocol it came up."""
+    try:
+        yield
+    except NotFiniteError as error:
+        raise NotFiniteError(f"{error} ({part})", error.arrays) from None
 
 
 def summarised(task: Task[Any], episodes: Episodes[Any]) -> Summary:

@@ -19,6 +19,7 @@ from tsbench.core.errors import TsbenchError, quoted
 from tsbench.core.files import encode_json, read_file, read_json
 from tsbench.core.policy import MAX_INFO, encode_info
 from tsbench.core.task import Task
+from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.score import Score
 from tsbench.runs.directory import MAX_CONFIG, MAX_SCORE, MAX_VERSIONS, Record, RunDirectory
 from tsbench.runs.schema import ELSEWHERE, encode, identity_hash
@@ -45,7 +46,10 @@ def check(run: RunDirectory, record: Record, task: Task[Any]) -> None:
     """
     settings = run.settings() if run.config_file.exists() else None
     versions = run.versions() if run.versions_file.exists() else None
-    faults = [(run.score_file, _of_stages(record, task))]
+    faults = [
+        (run.score_file, _of_stages(record, task)),
+        (run.score_file, _of_origin(record.score.origin)),
+    ]
     if settings is not None:
         faults.append((run.config_file, _of_command(run.command, settings)))
     if versions is not None:
@@ -82,6 +86,12 @@ def _of_stages(record: Record, task: Task[Any]) -> Iterator[str]:
         if stage.physics_substeps not in (0, stage.steps * task.substeps):
             steps = f"{stage.physics_substeps:,} physics steps in {stage.steps:,} steps"
             yield f"stage {name}: {steps}, where {task.substeps} each or none are possible"
+
+
+def _of_origin(origin: Origin) -> Iterator[str]:
+    for name in ("mjcf", "model", "constants"):
+        if not _HASH.fullmatch(value := getattr(origin, name)):
+            yield f"origin.{name} is no hash: {quoted(value)}"
 
 
 def _of_command(command: str, settings: Any) -> Iterator[str]:

@@ -23,7 +23,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from tsbench.core.files import check_new, parse_json, read_file, write_json, wri
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
+from tsbench.core.words import command
 from tsbench.evaluation.evaluate import check_fit
 from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.replay import contradictions
@@ -68,6 +69,7 @@ MAX_TRAININGS = 100
 MAX_ENTRY = 128 * 2**20  # bytes of all files together
 MAX_TEXT = 4000  # characters of a text in the manifest; a recipe may be a long command
 MAX_COUNT = 2**53  # steps
+MADE = "an entry is what tsbench submit has made of runs, unchanged"
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.+-]{0,63}")
 FILE = re.compile(rf"seed(0|[1-9][0-9]{{0,9}})/({'|'.join(map(re.escape, LIMITS))})")
@@ -220,7 +222,9 @@ class Manifest:
         if not 1 <= len(seeds) <= MAX_TRAININGS or seeds != sorted(set(seeds)):
             raise ValueError(f"trainings must be 1 to {MAX_TRAININGS}, by rising seed")
         if lacking := sorted(set(seeds) - set(self.described.seeds_trained)):
-            raise ValueError(f"described.seeds_trained lacks the kept seed {lacking[0]}")
+            raise ValueError(
+                f"described.seeds_trained lacks the kept seed {lacking[0]}: say --trained"
+            )
         folders = {training.folder for training in self.trainings}
         for path in self.files:
             if not FILE.fullmatch(path) or path.partition("/")[0] not in folders:
@@ -254,7 +258,7 @@ class Manifest:
         except TsbenchError as error:
             raise ValueError(str(error)) from None
         if manifest.encode() != content:
-            raise ValueError("it is not written as tsbench writes it, or was changed (digest)")
+            raise ValueError(f"its digest or its form is another: {MADE}")
         return manifest
 
 
@@ -328,11 +332,15 @@ def read_entry(path: Path) -> Entry:
     _check_place(path, manifest)
     for name in sorted(found ^ set(manifest.files)):
         missing = name in manifest.files
-        raise TsbenchError(f"{path / name} is {'missing' if missing else 'not in the manifest'}")
+        raise TsbenchError(
+            f"{path / name} is {'missing' if missing else 'not in the manifest'}: {MADE}"
+        )
     for name, said in manifest.files.items():
         data = read_file(path / name, LIMITS[name.partition("/")[2]])
         if hash_of(data) != said:
-            raise TsbenchError(f"{path / name} is not the file that the manifest names: it differs")
+            raise TsbenchError(
+                f"{path / name} differs from the file that the manifest names: {MADE}"
+            )
     kept = (
         _read_training(RunDirectory(path / training.folder), training, manifest)
         for training in manifest.trainings
@@ -347,8 +355,12 @@ def _files(path: Path) -> set[str]:
     Raises:
         TsbenchError: there is no such directory, or something in it that no entry has.
     """
-    if path.is_symlink() or not path.is_dir():
+    if path.is_symlink():
+        raise TsbenchError(f"{path} is a link: name the entry itself")
+    if not path.is_dir():
         raise TsbenchError(f"no entry {path}")
+    if not os.path.lexists(path / MANIFEST):
+        raise TsbenchError(f"{path} is no entry, it has no {MANIFEST}: {MADE}")
     found, total = set(), 0
     for folder, name in _listed(path):
         place = path / folder / name
@@ -358,7 +370,7 @@ def _files(path: Path) -> set[str]:
         inside = f"{folder}/{name}" if folder else name
         limit = MAX_MANIFEST if inside == MANIFEST else LIMITS.get(name, 0)
         if inside != MANIFEST and not FILE.fullmatch(inside):
-            raise TsbenchError(f"{place} is no file of an entry")
+            raise TsbenchError(f"{place} is no file of an entry: remove it")
         if status.st_size > limit:
             raise TsbenchError(f"{place} is larger than the {limit:,} bytes that are allowed")
         total += status.st_size
@@ -402,7 +414,9 @@ def _check_place(path: Path, manifest: Manifest) -> None:
     where = path.absolute()
     if (where.parent.name, where.name) != (manifest.task, manifest.described.entry):
         place = f"{manifest.task}/{manifest.described.entry}"
-        raise TsbenchError(f"{path} holds the entry {place}: its place is another directory")
+        raise TsbenchError(
+            f"{path} holds the entry {place}: move it there, or submit its runs by another name"
+        )
     protocol = PROTOCOLS.get(manifest.protocol)
     if protocol is None or not protocol.ranked:
         name = quoted(manifest.protocol)
@@ -492,7 +506,11 @@ def _check_agreement(
             )
     for what, values in said:
         if any(value != values[0] for value in values):
-            raise TsbenchError(f"{run.path} mixes several runs: its files disagree on the {what}")
+            told = dict.fromkeys(quoted(one) for one in values if isinstance(one, (str, int)))
+            which = f" ({', '.join(told)})" if told else ""
+            raise TsbenchError(
+                f"{run.path} mixes several runs: its files disagree on the {what}{which}"
+            )
 
 
 def cost(training: Training) -> tuple[int, int, float]:
@@ -517,6 +535,9 @@ def _remarks(run: RunDirectory, task: Task[Any]) -> Iterator[str]:
     run.roadmap(task)
     plan, reference = run.plan(task), run.reference(task)
     if plan is None or reference is None:
+        for lone, lacking in ((plan, run.reference_file), (reference, run.plan_file)):
+            if lone is not None:
+                yield f"{run.path.name}: nobody can audit the {lone.kind} without {lacking.name}"
         return
     failures = plannable(task).audit(plan, reference).failures
     if failures:
@@ -582,16 +603,31 @@ def pack(
     with os_errors(board):
         board.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix=".submit-", dir=board))
+    copies: dict[Path, Path] = {}
     try:
         with os_errors(folder):
-            parts = [
-                _pack_run(RunDirectory(run), folder / str(i), protocol, told, i, score, rescore)
-                for i, run in enumerate(runs)
-            ]
+            parts = []
+            for i, run in enumerate(runs):
+                copies[folder / str(i)] = run
+                part = _pack_run(
+                    RunDirectory(run), folder / str(i), protocol, told, i, score, rescore
+                )
+                parts.append(part)
+                record = part[1]
+                copies[folder / record.task / described.entry / f"seed{record.seed}"] = run
             return _pack_entry(parts, described, folder, protocol, told)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, TsbenchError):
+            raise TsbenchError(_naming(copies, str(error))) from None
         raise
+
+
+def _naming(copies: Mapping[Path, Path], text: str) -> str:
+    """The text with the runs in the place of their copies, which are gone when it is read."""
+    for copy, run in copies.items():
+        text = re.sub(rf"{re.escape(str(copy))}(?!\w)", str(run).replace("\\", r"\\"), text)
+    return text
 
 
 def discard(entry: Path) -> None:
@@ -609,7 +645,7 @@ def home(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) -> 
     place = board / protocol.name / entry.parent.name / entry.name
     with os_errors(place):
         if not _lie_in(place, entry, runs):
-            check_new(place, parents=True)
+            check_new(place, "give another --name", parents=True)
             return place
         check_new(place / MANIFEST)
         for name in read_manifest(entry).files:
@@ -655,9 +691,7 @@ def _pack_run(
 ) -> tuple[Path, Record]:
     """Copies a run's files, reading each of them once, and makes its score if it has none."""
     if not run.policy_info_file.exists():
-        alone = "; an action log alone is no entry: it cannot be scored from other starts"
-        reason = alone if run.actions_file.exists() else ""
-        raise TsbenchError(f"{run.path} holds no policy (no {run.policy_info_file.name}){reason}")
+        raise TsbenchError(_without_policy(run))
     folder.mkdir()
     for name, limit in LIMITS.items():
         path = run.path / name
@@ -668,11 +702,17 @@ def _pack_run(
     copy = RunDirectory(folder)
     before = copy.record() if copy.finished else None
     if before is None and told is None:
+        if copy.begun:
+            raise TsbenchError(_unfinished(run))
         raise TsbenchError(
             f"{run.path} has no {run.score_file.name}: of a policy that tsbench did not train "
             "say --seeds, --steps, --seconds and --command"
         )
     if before is not None and before.score.protocol == protocol.name and not rescore:
+        if not copy.actions_file.exists():
+            raise TsbenchError(
+                f"{run.path} has no {run.actions_file.name}: --rescore makes it, with the score"
+            )
         return folder, before
     trained = copy.policy()
     task = copy.task(trained.info.task)
@@ -687,6 +727,27 @@ def _pack_run(
     record = replace(before, score=made)
     write_json(copy.score_file, record.as_dict())
     return folder, record
+
+
+def _without_policy(run: RunDirectory) -> str:
+    """Why a directory is no part of an entry, and what to name instead."""
+    place, lacking = run.path, f"{run.path} holds no policy (no {run.policy_info_file.name})"
+    if not place.is_dir():
+        return f"no run directory {place}"
+    if run.begun:
+        return _unfinished(run)
+    if any(place.glob("seed*/policy.json")):
+        return f"{lacking}: name the trainings in it, {place / 'seed*'}"
+    if run.actions_file.exists():
+        return f"{lacking}; an action log alone is no entry: it cannot be scored from other starts"
+    return lacking
+
+
+def _unfinished(run: RunDirectory) -> str:
+    if run.failure:
+        return f"{run.path} has failed and cannot be submitted: {run.failure}"
+    way_on = command("run", f"resume={run.path}")
+    return f"{run.path} has no {run.score_file.name}, its run is not finished: {way_on}"
 
 
 def _record(told: Told, number: int, trained: Policy, task: Task[Any], made: Score) -> Record:
@@ -716,10 +777,16 @@ def _pack_entry(
     for name in ("task", "method", "budget", "task_version"):
         values = sorted({str(getattr(record, name)) for _, record in parts})
         if len(values) > 1:
-            raise TsbenchError(f"the runs are of more than one {name}: {', '.join(values)}")
+            found = f"{name}: {', '.join(values)}"
+            raise TsbenchError(
+                f"the runs are of more than one {found}; each is an entry of its own"
+            )
     seeds = [record.seed for _, record in parts]
     if len(set(seeds)) < len(seeds):
-        raise TsbenchError(f"two of the runs have the same seed: {sorted(seeds)}")
+        twice = next(seed for seed in seeds if seeds.count(seed) > 1)
+        raise TsbenchError(
+            f"two of the runs have the same seed, {twice}: an entry keeps one training of each"
+        )
     entry = folder / first.task / described.entry
     entry.mkdir(parents=True)
     files: dict[str, FileHash] = {}

@@ -136,10 +136,7 @@ def verify(path: Path, asked: Asked, tell: Tell = lambda line: None) -> Verdict:
         seconds = round(time.perf_counter() - began, 3)
         return Verdict(str(path), "", "", False, (f"refused: {error}",), (), seconds)
     findings = _Findings(entry)
-    try:
-        _verify(entry, asked, findings, tell)
-    except TsbenchError as error:
-        findings.failed(str(error))
+    _verify(entry, asked, findings, tell)
     return findings.verdict(round(time.perf_counter() - began, 3))
 
 
@@ -211,7 +208,10 @@ def _verify(entry: Entry, asked: Asked, findings: _Findings, tell: Tell) -> None
         words = []
         for kept in entry.kept if wanted else ():
             tell(f"{entry.name}, seed {kept.training.seed}: is it {state}?")
-            holds, said = tier(kept, asked, findings)
+            try:
+                holds, said = tier(kept, asked, findings)
+            except TsbenchError as error:  # such as a policy whose actions overflow
+                holds, said = False, f"broke off: {error}"
             words.append(f"{kept.run.path.name} {said}")
             if not holds:
                 findings.failed(f"not {state}: {words[-1]}")

@@ -41,7 +41,7 @@ from tsbench.rl.devices import torch_device
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
 from tsbench.runs import events
-from tsbench.runs.directory import Record, RunDirectory
+from tsbench.runs.directory import CHECKPOINTS, Record, RunDirectory
 from tsbench.runs.progress import Output, progress_bar
 from tsbench.runs.provenance import check_provenance, identity, write_provenance
 from tsbench.runs.schema import RunConfig
@@ -124,8 +124,9 @@ def resume(directory: Path, console: Console | None = None) -> Score:
     """Continues an interrupted run, and ends with the same bits as an uninterrupted run.
 
     Raises:
-        TsbenchError: the run does not exist, is finished or is running, or was begun with another
-            configuration or other versions. Beyond that, as `execute`.
+        TsbenchError: the run does not exist, is finished or is running, was begun with another
+            configuration or other versions, or would be written through a link. Beyond that, as
+            `execute`.
         PlanError: the run has ended with a plan that fails, as it would again.
         Stopped: Ctrl-C or SIGTERM stopped the run.
     """
@@ -142,6 +143,9 @@ def resume(directory: Path, console: Console | None = None) -> Score:
         config = replace(run.config(), directory=str(directory))
         problem = prepare(config)
         check_provenance(run, config, problem)
+        for name in (CHECKPOINTS, *events.LOGGERS):  # in whose folders files are replaced
+            if (run.path / name).is_symlink():
+                raise TsbenchError(f"{run.path / name} is a link: put the folder in its place")
         with _explained(run):
             for folder in (run.path, run.checkpoints):
                 for path, _ in leftovers(folder) if folder.is_dir() else ():

@@ -379,8 +379,7 @@ class Rocket(Plannable[RocketState]):
     def reference(self, plan: Plan) -> ReferenceMotion:
         """The plan, interpolated linearly to the control rate."""
         steps = int(plan.times[-1] / self.timestep + 1e-9)
-        times = np.arange(steps + 1) * self.timestep
-        qpos = np.stack([np.interp(times, plan.times, column) for column in plan.states.T], axis=-1)
+        qpos = _along(plan, np.arange(steps + 1) * self.timestep)
         return ReferenceMotion(
             task=self.name,
             task_version=self.version,
@@ -393,8 +392,11 @@ class Rocket(Plannable[RocketState]):
         path = plan.states[:, :2]
         final = float(np.linalg.norm(path[-1] - self.goal))
         speed = float(np.abs(np.diff(path, axis=0)).max() / plan.timestep)
+        followed = _along(plan, reference.times)[:, :2]
+        away = float(np.linalg.norm(reference.qpos[:, :2] - followed, axis=-1).max())
         items = [
             AuditItem("distance of the plan's end from the goal", final, C.success_distance, "m"),
+            AuditItem("distance of the reference motion from the plan", away, 1e-6, "m"),
             AuditItem("speed per axis", speed, C.plan_step / C.plan_timestep + 1e-6, "m/s"),
         ]
         for number, obstacle in enumerate(self.obstacles, 1):
@@ -408,6 +410,11 @@ class Rocket(Plannable[RocketState]):
     def tracker(self, reference: ReferenceMotion, form: str | None = None) -> RocketTracker:
         """`paper` is the printed reward, `progress` a dense one (`RocketTracker`)."""
         return RocketTracker(self, reference, self.imitation_form(form))
+
+
+def _along(plan: Plan, times: np.ndarray) -> np.ndarray:
+    """Position and angle of a plan at times (k,) in seconds, linear between its states, (k, 3)."""
+    return np.stack([np.interp(times, plan.times, column) for column in plan.states.T], axis=-1)
 
 
 class RocketAbstraction(Abstraction[RocketState]):

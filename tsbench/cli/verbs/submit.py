@@ -73,8 +73,7 @@ def call(words: Sequence[str]) -> int:
         rescore=options.rescore,
     )  # fmt: skip
     try:
-        if not options.check:
-            submission.home(packed, options.board, V1, options.runs)
+        submission.home(packed, options.board, V1, options.runs)
         asked = verify.Asked(rescore=options.check, threads=options.threads)
         verdict = verify.verify(packed, asked, tell(console))
         show_verdict(Console(), verdict)
