@@ -316,9 +316,10 @@ def test_onnx_weights_that_are_not_read(tmp_path: Path) -> None:
         foreign.load(path, TASK)
 
 
-@pytest.mark.parametrize("kind", ["LSTM", "GRU", "Scan"])
+@pytest.mark.parametrize("kind", ["LSTM", "GRU", "RNN", "Scan", "Loop", "If"])
 def test_an_onnx_file_with_a_memory_is_refused(kind: str, tmp_path: Path) -> None:
-    """One step of it, from an empty memory, would act otherwise than the model did."""
+    """One step of it, from an empty memory, would act otherwise than the model did. A loop may also
+    never end."""
     model = onnx.load(write_onnx(tmp_path / "p.onnx"))
     model.graph.node.append(helper.make_node(kind, ["y"], ["z"]))
     onnx.save(model, str(tmp_path / "q.onnx"))
