@@ -239,6 +239,15 @@ def test_cards_cut_no_name(name: str, width: int) -> None:
     assert f"{tasks.make(name).observation_size} numbers" in text
 
 
+def test_a_card_has_two_names(capsys: pytest.CaptureFixture[str]) -> None:
+    """`list` says what there is, so a newcomer asks it about a task too."""
+    cards = []
+    for verb in ("list", "describe"):
+        assert cli.main([verb, "rocket_navigation"]) == 0
+        cards.append(capsys.readouterr().out)
+    assert cards[0] == cards[1] != ""
+
+
 @pytest.mark.parametrize("width", [40, 80])
 def test_scores_cut_no_name(width: int, invented_record: Callable[[str], Record]) -> None:
     record = invented_record("laikago_trot")

@@ -24,6 +24,16 @@ def test_every_task_has_a_config_with_the_three_budgets(name: str) -> None:
     assert chosen.task.constants == {}
 
 
+@pytest.mark.parametrize("name", tasks.names())
+def test_a_default_training_is_no_longer_than_it_was_measured(name: str) -> None:
+    """A bound on the steps, which are the same on every machine, in place of one on the minutes.
+    The smoke budget, which shows that all parts work, is at most a hundredth of it."""
+    budgets = config.compose([f"task={name}"]).task.budgets
+    fast, smoke = (budgets[kind].plan + budgets[kind].act for kind in ("fast", "smoke"))
+    assert fast <= 5_000_000
+    assert smoke <= fast / 100
+
+
 @pytest.mark.parametrize(
     ("name", "plan", "act"),
     [

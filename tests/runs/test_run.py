@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -491,6 +493,35 @@ def test_a_run_that_cannot_begin_leaves_nothing(
     with pytest.raises(TsbenchError, match="cannot do this task"):
         execute(tmp_path / "mine")
     assert not (tmp_path / "mine").exists()
+
+
+def test_each_part_of_a_run_is_told_before_its_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a reader waits for stands in the output, also in a file: the run's directory before the
+    first step of training, each stage while it goes on, the evaluation before its first episode."""
+    out, seen = io.StringIO(), dict[str, str]()
+
+    def spied(module: str, name: str) -> None:
+        function = getattr(importlib.import_module(module), name)
+
+        def spy(*given: Any, **named: Any) -> Any:
+            seen.setdefault(name, out.getvalue())
+            return function(*given, **named)
+
+        monkeypatch.setattr(f"{module}.{name}", spy)
+
+    spied("tsbench.methods.twostage", "train")
+    spied("tsbench.runs.execute", "evaluate")
+    words = [*WORDS, "threads=1", "task.budgets.smoke.act=512", "task.constants.distance=6.0"]
+    chosen = replace(config.compose(words), directory=str(tmp_path / "mine"))
+    run.execute(chosen, words, Console(file=out, width=200))
+    first = f" -> {tmp_path / 'mine'}\n"
+    assert seen["train"].startswith("tsbench run ")
+    assert seen["train"].endswith(first)
+    lines = seen["evaluate"].partition(first)[2].splitlines()
+    assert [line for line in lines if re.match(r"(plan|imitate) +\d+%", line)]
+    assert lines[-1] == "evaluation by protocol smoke"
 
 
 def test_a_run_that_fails_later_keeps_what_it_has(

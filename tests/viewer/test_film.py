@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from tsbench import cli
 from tsbench.core.errors import TsbenchError
 from tsbench.viewer import film
 from tsbench.viewer.show import (
@@ -165,6 +166,79 @@ def test_the_end_of_a_film_is_drawn_once(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert next(reader)["source_size"] in (film.SIZE, film.SMALL_SIZE)
     frames, _ = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))
     assert frames == 15 + film.FRAMES_PER_SECOND
+
+
+@pytest.mark.parametrize(
+    ("renderer", "size", "quality"),
+    [
+        (b"llvmpipe (LLVM 19.1.7, 256 bits)", film.SMALL_SIZE, film.SLOW_QUALITY),
+        (b"softpipe", film.SMALL_SIZE, film.SLOW_QUALITY),
+        (b"NVIDIA H100/PCIe/SSE2", film.SIZE, film.QUALITY),
+    ],
+)
+def test_a_film_is_small_where_no_gpu_draws_it(
+    renderer: bytes,
+    size: tuple[int, int],
+    quality: tuple[int, int, int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So that it takes seconds: less than half the pixels, none of them drawn four times."""
+    with film.Camera(Show(*ball_at_rest())):
+        pass  # OpenGL is loaded
+    monkeypatch.setattr("OpenGL.GL.glGetString", lambda name: renderer)
+    shown = Show(*ball_at_rest())
+    with film.Camera(shown) as camera:
+        assert camera.size == size
+        assert camera.frame(0.0).shape == (size[1], size[0], 3)
+    look = shown.model.vis.quality
+    assert (look.offsamples, look.numslices, look.numstacks) == quality
+
+
+def ball_at_rest(steps: int = 4, timestep: float = 0.5) -> tuple[mujoco.MjModel, list[Actor], str]:
+    qpos = np.tile([0.0, 0.0, 0.4, 1.0, 0.0, 0.0, 0.0], (steps, 1))
+    actors = [Actor("executed", qpos, timestep, EXECUTED_COLOUR, "")]
+    return mujoco.MjModel.from_xml_string(BALL.format(more="")), actors, ""
+
+
+@pytest.mark.parametrize("timestep", [1 / 600, 1 / 50, 0.5])
+def test_a_film_has_as_many_pictures_as_its_seconds_need(
+    timestep: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """30 a second and the last one, however finely the motion was simulated."""
+    drawn = list[float]()
+    blank = np.zeros((*film.SMALL_SIZE[::-1], 3), np.uint8)
+
+    def noted(_: film.Camera, time: float) -> film.Picture:
+        drawn.append(time)
+        return blank
+
+    monkeypatch.setattr(film.Camera, "frame", noted)
+    shown = Show(*ball_at_rest(round(1.5 / timestep) + 1, timestep))
+    film.write_video(shown, tmp_path / "film.mp4")
+    assert len(drawn) == 45 + 1
+    assert (tmp_path / "film.mp4").stat().st_size < 100_000
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_shows_how_much_of_a_film_is_done(
+    terminal: bool,
+    make_run: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    """A file or a pipe gets no bar, and standard output has only the film's name."""
+
+    def write(show: Show, path: Path, progress: film.Progress) -> None:
+        progress(0.5)
+
+    monkeypatch.setattr(film, "write_video", write)
+    monkeypatch.setenv("TTY_COMPATIBLE", "1" if terminal else "0")
+    path = tmp_path / "film.mp4"
+    assert cli.main(["view", str(make_run("rocket_navigation")), "--video", str(path)]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{path}\n"
+    assert ("video" in captured.err and "50%" in captured.err) == terminal
 
 
 def test_what_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

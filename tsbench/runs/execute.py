@@ -277,6 +277,7 @@ def _train(
     check_fit(policy, problem.task)
     policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
+    workspace.note(f"evaluation by protocol {protocol.name}")
     with progress_bar(console, "evaluate") as progress:
         score = evaluate(
             policy, problem.task, protocol=protocol, threads=problem.threads, progress=progress
