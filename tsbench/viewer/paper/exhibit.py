@@ -205,19 +205,19 @@ def compare(
 ) -> Iterator[Claim]:
     """The paper's order of two methods on a task, beside what came out of it.
 
-    The order holds where the 95 % interval of the paired difference of `normalized_reward` lies
-    above zero, or with `ties` not below it, and cannot be told without an interval.
+    The order holds where the 95 % interval of the paired difference of `solved_reward`, which ranks
+    the rows, lies above zero, or with `ties` not below it. Without an interval it cannot be told.
     """
     first, second = (main_group(groups, task, name) for name in (better, worse))
     if first is None or second is None:
         return
-    found = difference(first, second, "normalized_reward")
+    found = difference(first, second, "solved_reward")
     means = " and ".join(
-        f"{group.label} {np.mean(list(group.values('normalized_reward').values())):.3f} "
+        f"{group.label} {np.mean(list(group.values('solved_reward').values())):.3f} "
         f"({several(len(group.rows), 'seed')})"
         for group in (first, second)
     )
-    text = f"{task}: normalized reward {means}"
+    text = f"{task}: solved reward {means}"
     if found is None:
         yield Claim(says, f"{text}; no seed in common", None)
         return

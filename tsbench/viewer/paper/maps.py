@@ -24,7 +24,7 @@ def exhibits(results: Results, groups: Sequence[Group]) -> Iterator[Exhibit]:
         rows = [row for row in group.rows if row.words in results.folders] if group else []
         if not rows:
             continue
-        best = max(rows, key=lambda row: row.normalized_reward)
+        best = max(rows, key=lambda row: (row.solved_reward, row.normalized_reward))
         run = results.folders[best.words]
         task = run.task(task_name)
         if isinstance(task, Plannable) and task.drawing().still is not None:

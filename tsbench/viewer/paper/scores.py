@@ -38,7 +38,7 @@ class Line:
         success: mean share of the perturbed starts solved.
         succeeding: seeds that solve at least `ENOUGH` of them.
         measures: means of the task's leading measures, over the seeds that have them.
-        against: `normalized_reward` less that of the two-stage method with the same seeds.
+        against: `solved_reward` less that of the two-stage method with the same seeds.
         p_value: of that, after Holm over the table; None without one.
     """
 
@@ -59,7 +59,7 @@ def table(groups: Sequence[Group], tasks: dict[str, Task]) -> list[Line]:
     for group in ordered:
         ours = main_group(groups, group.task, OURS)
         if ours is not None and group is not ours:
-            found = difference(group, ours, "normalized_reward")
+            found = difference(group, ours, "solved_reward")
             if found is not None:
                 against[group] = found
     corrected = holm({str(i): one.p_value for i, one in enumerate(against.values())})

@@ -45,7 +45,10 @@ def exhibits(
             ]
             if shown:
                 group = max(shown, key=lambda group: len(group.rows))
-                best = max(_at_hand(results, group), key=lambda row: row.normalized_reward)
+                best = max(
+                    _at_hand(results, group),
+                    key=lambda row: (row.solved_reward, row.normalized_reward),
+                )
                 policy = results.folders[best.words].policy()
                 cast[group] = (best, record_episode(tasks[name], policy))
         if cast:
