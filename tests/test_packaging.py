@@ -19,7 +19,7 @@ import pytest
 from tsbench import methods, tasks
 
 ROOT = Path(__file__).parents[1]
-MOST_BYTES = 6_000_000  # a wheel has 3.5 MB, an sdist 4.4
+MOST_BYTES = 10_000_000  # a wheel has 6.7 MB, an sdist 8.0; each kept training is 0.2 to 0.35
 
 
 @pytest.fixture(scope="module")

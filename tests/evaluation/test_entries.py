@@ -75,7 +75,9 @@ def test_an_entry_repeats(entry: Path) -> None:
         assert replay(task, score, log)
     if (now.packages, now.machine) == (then.packages, then.machine):
         assert again.nominal == score.nominal
-    assert again.against_plan == pytest.approx(score.against_plan, abs=0.1)  # of ten starts
+    # Of ten starts, whose mean says little where some of them end in falls.
+    near = 0.5 if score.perturbed.violations else 0.1
+    assert again.against_plan == pytest.approx(score.against_plan, abs=near)
     assert compare(score, again, task, log).kind == "none"  # other protocols
 
 
