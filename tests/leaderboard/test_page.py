@@ -79,7 +79,8 @@ def test_rows_are_sorted_and_say_how_sure_they_are(board: Path) -> None:
     assert rows["one"].state == "re-scored"
     assert rows["ten"].state == "submitted"
     assert left_out == [f"v1/{TASK}/gone: retracted: a bug"]
-    assert {"zero", "random"} <= set(table.references)
+    assert {"oracle", "zero", "random"} <= set(table.references)
+    assert table.references["oracle"]["solved_reward"] == table.best > 0.0
 
 
 def test_tables_in_markdown(board: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,6 +89,7 @@ def test_tables_in_markdown(board: Path, capsys: pytest.CaptureFixture[str]) -> 
     text = (board / "README.md").read_text()
     assert text.startswith("# Leaderboards\n")
     assert re.search(r"\| one \| [0-9.]+ \| \d+% \|.*\| re-scored \| 7 \| 1 \|", text)
+    assert re.search(r"\| oracle \| 0\.\d+ \|  \| 1 \|  \| - \|  \|  \| reference \|", text)
     assert "retracted: a bug" in text
     assert cli.main(["leaderboard", "--board", str(board), "--readme"]) == 0
     assert (board / "README.md").read_text() == text
