@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 
 from tsbench.core.words import several
 from tsbench.evaluation.statistics import Difference, paired_difference
-from tsbench.runs.results import Result
+from tsbench.runs.results import Result, Results
 
 # The paper's methods, by the names that they have here. They stand here and not beside each method,
 # because the figures tell what the paper claims of these four, most often of two of them together.
@@ -234,6 +234,12 @@ def main_group(groups: Sequence[Group], task: str, method: str) -> Group | None:
     """The method's group on a task, of several the one with the most seeds."""
     found = [group for group in groups if (group.task, group.method) == (task, method)]
     return max(found, key=lambda group: len(group.rows)) if found else None
+
+
+def best_at_hand(results: Results, group: Group) -> Result | None:
+    """The best of the group's results whose policies are at hand; None without one."""
+    rows = [row for row in group.rows if row.words in results.folders and row.score]
+    return max(rows, key=lambda row: (row.solved_reward, row.normalized_reward), default=None)
 
 
 def by_task(groups: Sequence[Group]) -> Mapping[str, list[Group]]:

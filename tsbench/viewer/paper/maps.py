@@ -10,7 +10,16 @@ import numpy as np
 from tsbench.core.motion import ReferenceMotion
 from tsbench.core.task import Plannable
 from tsbench.runs.results import Results
-from tsbench.viewer.paper.exhibit import OURS, SHARES, Claim, Exhibit, Group, drawing, main_group
+from tsbench.viewer.paper.exhibit import (
+    OURS,
+    SHARES,
+    Claim,
+    Exhibit,
+    Group,
+    best_at_hand,
+    drawing,
+    main_group,
+)
 
 PIXELS = 160  # along the longer side of a map
 FELT = 0.01  # share of the largest reward that a learner may feel
@@ -21,10 +30,9 @@ def exhibits(results: Results, groups: Sequence[Group]) -> Iterator[Exhibit]:
     seeds at hand."""
     for task_name in dict.fromkeys(group.task for group in groups):
         group = main_group(groups, task_name, OURS)
-        rows = [row for row in group.rows if row.words in results.folders] if group else []
-        if not rows:
+        best = best_at_hand(results, group) if group else None
+        if best is None:
             continue
-        best = max(rows, key=lambda row: (row.solved_reward, row.normalized_reward))
         run = results.folders[best.words]
         task = run.task(task_name)
         if isinstance(task, Plannable) and task.drawing().still is not None:

@@ -17,6 +17,7 @@ from tsbench.viewer.paper.exhibit import (
     Claim,
     Exhibit,
     Group,
+    best_at_hand,
     by_task,
     drawing,
 )
@@ -40,24 +41,17 @@ def exhibits(
             continue
         cast: dict[Group, tuple[Result, Recording]] = {}
         for method in dict.fromkeys(group.method for group in members):
-            shown = [
-                group for group in members if group.method == method and _at_hand(results, group)
-            ]
-            if shown:
-                group = max(shown, key=lambda group: len(group.rows))
-                best = max(
-                    _at_hand(results, group),
-                    key=lambda row: (row.solved_reward, row.normalized_reward),
-                )
-                policy = results.folders[best.words].policy()
-                cast[group] = (best, record_episode(tasks[name], policy))
+            known = {
+                group: best
+                for group in members
+                if group.method == method and (best := best_at_hand(results, group))
+            }
+            if known:
+                group = max(known, key=lambda group: len(group.rows))
+                policy = results.folders[known[group].words].policy()
+                cast[group] = (known[group], record_episode(tasks[name], policy))
         if cast:
             yield _exhibit(tasks[name], cast)
-
-
-def _at_hand(results: Results, group: Group) -> list[Result]:
-    """The group's results whose policies are at hand."""
-    return [row for row in group.rows if row.words in results.folders and row.score]
 
 
 def _exhibit(task: Task, cast: dict[Group, tuple[Result, Recording]]) -> Exhibit:
