@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from tsbench.runs.results import Curve, Result, Results
 from tsbench.viewer import comparison
 
 TASK = "rocket_navigation"
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(name="made")
@@ -95,5 +97,10 @@ def test_compare_kept_entries(
     assert "rocket_navigation, seed by seed" in text
     assert "twostage less prm" in text
     assert (tmp_path / "found.json").exists()
-    assert cli.main([*words, "--png", "x.png"]) == 2  # entries have no metrics
+    kept = ROOT / "leaderboards" / "v1" / "rocket_navigation" / "prm"
+    bare = [shutil.copytree(kept / name, tmp_path / name) for name in ("seed3", "seed9")]
+    for folder in bare:
+        (folder / "metrics.jsonl").unlink()
+    assert cli.main(["compare", *map(str, bare), "--png", "x.png"]) == 2
+    assert "none of these has its metrics.jsonl" in capsys.readouterr().err
     assert not (tmp_path / "x.png").exists()

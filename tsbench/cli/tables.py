@@ -17,7 +17,7 @@ from tsbench.core.task import Task
 from tsbench.core.words import command, duration, number, short
 from tsbench.evaluation.flips import Flips
 from tsbench.evaluation.score import Score
-from tsbench.evaluation.statistics import RANKED_SEEDS, iqm
+from tsbench.evaluation.statistics import PROVISIONAL_SEEDS, RANKED_SEEDS, iqm
 from tsbench.evaluation.words import (
     FIGURES,
     counts,
@@ -140,11 +140,12 @@ def show_runs(console: Console, runs: Mapping[str, Results]) -> None:
 
 
 def show_pairs(console: Console, pairs: Sequence[Pair]) -> None:
-    """Prints the differences of `solved_reward` between groups of runs, and how sure they are."""
+    """Prints the differences of `solved_reward` between groups of runs, and how sure they are. One
+    or two seeds say nothing of the methods, so their mean is not shown."""
     rows: dict[str, list[Sequence[str]]] = {}
     for pair in pairs:
         mean = interval = "-"
-        if (found := pair.difference) is not None:
+        if (found := pair.difference) is not None and pair.seeds >= PROVISIONAL_SEEDS:
             mean = f"{found.mean:+.4f}"
             if found.interval is not None:
                 interval = f"{found.interval[0]:+.4f} to {found.interval[1]:+.4f}"
@@ -155,7 +156,8 @@ def show_pairs(console: Console, pairs: Sequence[Pair]) -> None:
     for task, members in rows.items():
         show_rows(console, headers, members, title=f"{task}, seed by seed")
     if any(pair.difference is None or pair.difference.interval is None for pair in pairs):
-        line = f"Over the seeds that both have; an interval needs {RANKED_SEEDS} of them."
+        line = f"Over the seeds that both have; a mean needs {PROVISIONAL_SEEDS} of them, "
+        line += f"an interval {RANKED_SEEDS}."
         console.print(line, highlight=False)
 
 
