@@ -243,7 +243,7 @@ def check_pip(words: list[str]) -> None:
         elif word.startswith((".", "/")):
             assert (ROOT / word).exists()
         else:
-            assert re.fullmatch(r"--\w+|build|pytest|pre-commit", word)
+            assert re.fullmatch(r"--\w+|build|mjlab|pytest|pre-commit", word)
 
 
 def check_python(words: list[str]) -> None:
