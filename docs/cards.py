@@ -186,9 +186,9 @@ def _results(table: Table) -> str:
         method = _method(row)
         linked = f"[{row.name}](../methods/{method}.md)" if method in methods.names() else row.name
         rows.append((linked, *_figures(row)))
-    rows.append(("best plan", "", number(table.best), "", "", "", ""))
     for name, given in sorted(table.references.items()):
-        shares = [f"{given[key]:.0%}" for key in ("success", "survival_100N", "recovery_100N")]
+        keys = ("success", "survival_100N", "recovery_100N")
+        shares = [f"{given[key]:.0%}" if key in given else "-" for key in keys]
         reward = number(given["solved_reward"])
         rows.append((f"`{name}`", shares[0], reward, *shares[1:], "", ""))
     return _table(("", *RESULT_COLUMNS), rows)
