@@ -19,7 +19,7 @@ import pytest
 from tsbench import methods, tasks
 
 ROOT = Path(__file__).parents[1]
-MOST_BYTES = 10_000_000  # a wheel has 6.7 MB, an sdist 8.0; each kept training is 0.2 to 0.35
+MOST_BYTES = 15_000_000  # a wheel has 10.8 MB, an sdist 11.8; each kept training is 0.2 to 0.4
 
 
 @pytest.fixture(scope="module")
