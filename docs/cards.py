@@ -190,7 +190,8 @@ def _results(table: Table) -> str:
         keys = ("success", "survival_100N", "recovery_100N")
         shares = [f"{given[key]:.0%}" if key in given else "-" for key in keys]
         reward = number(given["solved_reward"])
-        rows.append((f"`{name}`", shares[0], reward, *shares[1:], "", ""))
+        label = "`oracle`, the best plan" if name == "oracle" else f"`{name}`"
+        rows.append((label, shares[0], reward, *shares[1:], "", ""))
     return _table(("", *RESULT_COLUMNS), rows)
 
 
