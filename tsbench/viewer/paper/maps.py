@@ -47,8 +47,11 @@ def _exhibit(task: Plannable[Any], reference: ReferenceMotion, seed: int) -> Exh
     names = ["reward R", *(f"imitation, {form}" for form in task.imitation_forms)]
     maps = [_worth(task, grid, reference, form) for form in (None, *task.imitation_forms)]
     along = np.stack([path[:, 0], np.zeros(len(path)), path[:, 1]], axis=-1)
+    lengths = np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1)
     felt = {
-        name: float(np.mean(_worth(task, along, reference, form) > FELT * values.max()))
+        name: float(
+            np.average(_worth(task, along, reference, form) > FELT * values.max(), weights=lengths)
+        )
         for name, form, values in zip(names, (None, *task.imitation_forms), maps, strict=True)
     }
     ratio = len(z) / len(x)
@@ -87,14 +90,14 @@ def _claims(
     yield Claim(
         "R is sparse: it is felt only very close to the goal or to obstacles.",
         f"{task}: R exceeds {FELT:.0%} of its largest value on {area:.0%} of the world and along "
-        f"{felt[names[0]]:.0%} of the plan",
-        area < 0.5,
+        f"{felt[names[0]]:.0%} of the plan's length",
+        max(area, felt[names[0]]) < 0.5,
     )
     for name in names[1:]:
         yield Claim(
             "R_imi is dense along the reference motion.",
             f"{task}, {name}: it exceeds {FELT:.0%} of its largest value along {felt[name]:.0%} of "
-            "the plan",
+            "the plan's length",
             felt[name] > 0.95,
         )
 
