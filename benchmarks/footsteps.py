@@ -24,6 +24,7 @@ from tsbench.core.motion import Plan
 from tsbench.core.task import Plannable, plannable, roadmap_space
 from tsbench.planning.roadmap import cycled, find_route
 from tsbench.sim.kinematic import naive_plan, plan_along, rolled_out
+from tsbench.viewer.paper.plans import step_lengths
 
 SAMPLES, NEIGHBOURS, SEEDS = 2000, 16, range(5)
 COLUMNS = ("plan steps", "return", "step, mm", "its spread, mm", "slip, mm", "audit")
@@ -41,12 +42,7 @@ def raw(task: Any, points: np.ndarray) -> Plan:
 def figures(task: Plannable[Any], plan: Plan) -> list[float]:
     reference = task.reference(plan)
     audit = task.audit(plan, reference)
-    feet, stands = reference.tracked["feet"], reference.tracked["contacts"]
-    lengths: list[float] = []
-    for foot in range(feet.shape[1]):
-        begins = np.flatnonzero(np.diff(stands[:, foot].astype(int)) == 1) + 1
-        begins = begins[reference.times[begins] < plan.times[-1]]
-        lengths.extend(np.diff(feet[begins, foot, 0]))
+    lengths = step_lengths(plan, reference)
     slip = next(item.value for item in audit.items if "slip" in item.what)
     steps = len(plan.rewards)
     earned = plan.rewards.sum() + task.max_reward * (task.abstraction().horizon - steps)

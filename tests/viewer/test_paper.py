@@ -24,7 +24,18 @@ from tsbench.runs.execute import prepare
 from tsbench.runs.provenance import write_provenance
 from tsbench.runs.results import Curve, Result, Results
 from tsbench.viewer.paper import ladder, learning, maps, page, plans, scores
-from tsbench.viewer.paper.exhibit import COLOURS, MONOLITHIC, OURS, PRM, Claim, compare, grouped
+from tsbench.viewer.paper.exhibit import (
+    COLOURS,
+    MONOLITHIC,
+    OURS,
+    PRM,
+    Claim,
+    Verdict,
+    compare,
+    grouped,
+    papers_group,
+    solves,
+)
 
 ROCKET = "rocket_navigation"
 Invented = Callable[[str], Record]
@@ -63,8 +74,8 @@ def of(rows: Sequence[Result]) -> Results:
     return Results({row.words: row for row in rows})
 
 
-def verdicts(claims: Sequence[Claim], says: str) -> list[bool | None]:
-    return [claim.holds for claim in claims if says in claim.says]
+def verdicts(claims: Sequence[Claim], says: str) -> list[Verdict]:
+    return [claim.verdict for claim in claims if says in claim.says]
 
 
 def test_a_method_has_one_colour_and_its_variants_paler_ones(make: Callable[..., Result]) -> None:
@@ -80,6 +91,15 @@ def test_a_method_has_one_colour_and_its_variants_paler_ones(make: Callable[...,
     assert len(set(colours)) == 5
 
 
+def test_variants_of_a_method_are_told_apart(make: Callable[..., Result]) -> None:
+    few, many = "task.training.imitate.epochs=2", "task.training.imitate.epochs=8"
+    (group,) = grouped(of([make(OURS, 0, 0.1, 1.0, few)]).groups())
+    assert group.label == f"{OURS}, other settings"
+    rows = [make(OURS, 0, 0.1, 1.0, few, distance=24.0), make(OURS, 0, 0.1, 1.0, many)]
+    labels = {group.label for group in grouped(of(rows).groups())}
+    assert labels == {f"{OURS}, other settings ({word})" for word in (few, many)}
+
+
 def test_any_method_has_its_own_name_and_colour(make: Callable[..., Result]) -> None:
     rows = [make(f"other{i}", 0, 0.1) for i in range(20)]
     groups = grouped(of([*rows, *(make(name, 0, 0.1) for name in COLOURS)]).groups())
@@ -88,18 +108,42 @@ def test_any_method_has_its_own_name_and_colour(make: Callable[..., Result]) -> 
 
 
 def test_an_order_holds_by_its_interval_and_not_by_its_mean(make: Callable[..., Result]) -> None:
-    def verdict(ours: Sequence[float], theirs: Sequence[float]) -> bool | None:
+    def verdict(ours: Sequence[float], theirs: Sequence[float]) -> Verdict:
         rows = [make(OURS, seed, reward) for seed, reward in enumerate(ours)]
         rows += [make(MONOLITHIC, seed, reward) for seed, reward in enumerate(theirs)]
         groups = grouped(of(rows).groups())
         (claim,) = compare(groups, ROCKET, OURS, MONOLITHIC, "better")
-        return claim.holds
+        return claim.verdict
 
     apart = [0.5 + 0.01 * seed for seed in range(10)]
-    assert verdict(apart, [0.1] * 10) is True
-    assert verdict([0.1] * 10, apart) is False
-    assert verdict([0.1, 0.9] * 5, [0.9, 0.1] * 5) is False
-    assert verdict(apart[:9], [0.1] * 9) is None  # too few seeds
+    assert verdict(apart, [0.1] * 10) is Verdict.HOLDS
+    assert verdict([0.1] * 10, apart) is Verdict.DIFFERS
+    assert verdict([0.1, 0.9] * 5, [0.9, 0.1] * 5) is Verdict.OPEN
+    assert verdict(apart[:9], [0.1] * 9) is Verdict.OPEN  # too few seeds
+
+
+def test_what_the_paper_says_of_its_roadmap_is_not_said_of_another(
+    make: Callable[..., Result],
+) -> None:
+    rows = [make(PRM, seed, 0.1) for seed in range(3)]
+    assert papers_group(grouped(of(rows).groups()), ROCKET, PRM) is None
+    rows.append(make(PRM, 0, 0.1, 1.0, "method.shortcut=false"))
+    found = papers_group(grouped(of(rows).groups()), ROCKET, PRM)
+    assert found is not None
+    assert found.label == f"{PRM}, shortcut=false"
+
+
+def test_a_method_solves_a_task_fails_it_or_does_so_in_part(make: Callable[..., Result]) -> None:
+    def verdict(successes: Sequence[float], *, good: bool) -> Verdict:
+        rows = [make(OURS, seed, 0.5, share) for seed, share in enumerate(successes)]
+        return solves(grouped(of(rows).groups()), "solved", good=good).verdict
+
+    assert verdict([0.95, 1.0, 1.0], good=True) is Verdict.HOLDS
+    assert verdict([0.95, 1.0, 1.0], good=False) is Verdict.DIFFERS
+    assert verdict([0.94, 1.0, 1.0], good=True) is Verdict.PART
+    assert verdict([0.94, 1.0, 1.0], good=False) is Verdict.PART
+    assert verdict([0.94, 0.0, 0.5], good=False) is Verdict.HOLDS
+    assert verdict([1.0, 1.0], good=True) is Verdict.OPEN
 
 
 def test_the_table_by_hand(make: Callable[..., Result]) -> None:
@@ -117,6 +161,7 @@ def test_the_table_by_hand(make: Callable[..., Result]) -> None:
     assert monolithic.against is not None
     assert (monolithic.against.mean, monolithic.against.interval) == (1.0 - 3.0, None)
     assert (prm.solved.iqm, prm.success, prm.succeeding) == (0.0, 0.0, 0)
+    assert monolithic.p_value is None  # it is not one of the comparisons that p is corrected for
     assert scores.cells(monolithic)[2] == "2, too few"
 
 
@@ -170,9 +215,11 @@ def test_the_printed_imitation_reward_is_as_sparse_as_the_task_s(
     row, path = make(OURS, 0, 0.5), make_run(ROCKET)
     found = replace(of([row]), folders={row.words: RunDirectory(path)})
     (exhibit,) = maps.exhibits(found, grouped(found.groups()))
-    assert verdicts(exhibit.claims, "R is sparse") == [True]
-    dense = {claim.found.split(", ")[2].split(":")[0]: claim.holds for claim in exhibit.claims[1:]}
-    assert dense == {"progress": True, "paper": False}
+    assert verdicts(exhibit.claims, "R is sparse") == [Verdict.HOLDS]
+    dense = {
+        claim.found.split(", ")[2].split(":")[0]: claim.verdict for claim in exhibit.claims[1:]
+    }
+    assert dense == {"progress": Verdict.HOLDS, "paper": Verdict.DIFFERS}
 
 
 def test_a_ladder_says_where_a_method_fails(make: Callable[..., Result]) -> None:
@@ -183,9 +230,9 @@ def test_a_ladder_says_where_a_method_fails(make: Callable[..., Result]) -> None
         for seed in range(3)
     ]
     (exhibit,) = ladder.exhibits(grouped(of(rows).groups()))
-    assert verdicts(exhibit.claims, "Two stages solve") == [True]
-    assert verdicts(exhibit.claims, "monolithic") == [False]
-    assert "1.00 at 24 m, 0.00 at 60 m" in exhibit.claims[0].found
+    assert verdicts(exhibit.claims, "Two stages solve") == [Verdict.HOLDS]
+    assert verdicts(exhibit.claims, "monolithic") == [Verdict.PART]
+    assert "3 of 3 seeds at 24 m, 0 of 3 seeds at 60 m" in exhibit.claims[0].found
     assert len(exhibit.rows) == 12
     standard = [row for row in rows if row.standard]
     assert not list(ladder.exhibits(grouped(of(standard).groups())))

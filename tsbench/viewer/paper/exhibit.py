@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import matplotlib
@@ -16,13 +17,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from tsbench.core.words import several
-from tsbench.evaluation.statistics import Difference, paired_difference
+from tsbench.evaluation.statistics import PROVISIONAL_SEEDS, Difference, paired_difference
 from tsbench.runs.results import Result, Results
 
 # The paper's methods, by the names that they have here. They stand here and not beside each method,
 # because the figures tell what the paper claims of these four, most often of two of them together.
 # Any other method needs no line: it has its own name and a spare colour.
 OURS, MONOLITHIC, PRM, PRM_RL = "twostage", "monolithic", "prm", "prm_rl"
+# What makes a method the paper's where its defaults do not: the paper's roadmap has no shortcuts.
+AS_IN_PAPER = {PRM: ("method.shortcut=false",)}
 
 # Colours of Okabe and Ito's palette, which colour-blind readers can tell apart. A method has the
 # same one in every figure; one that is not of the paper has a spare one.
@@ -43,7 +46,20 @@ STYLE = {
     "svg.fonttype": "none",  # text stays text
     "svg.hashsalt": "tsbench",
 }
-VERDICTS = {True: "as the paper says", False: "differs", None: "cannot be told yet"}
+ENOUGH = 0.95  # share of the perturbed starts that a seed has to solve to succeed
+
+
+class Verdict(StrEnum):
+    """Whether what came out is what the paper says."""
+
+    HOLDS = "as the paper says"
+    PART = "in part"
+    DIFFERS = "differs"
+    OPEN = "cannot be told yet"
+
+    @classmethod
+    def of(cls, holds: bool) -> Verdict:
+        return cls.HOLDS if holds else cls.DIFFERS
 
 
 @dataclass(frozen=True)
@@ -51,16 +67,12 @@ class Claim:
     """Attributes:
     says: what the paper says.
     found: what came out.
-    holds: whether they agree; None where the results are too few to tell.
+    verdict: whether they agree.
     """
 
     says: str
     found: str
-    holds: bool | None
-
-    @property
-    def verdict(self) -> str:
-        return VERDICTS[self.holds]
+    verdict: Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +136,15 @@ def grouped(groups: Sequence[Sequence[Result]]) -> list[Group]:
     others = sorted({rows[0].method for rows in groups} - COLOURS.keys())
     colours = COLOURS | {name: SPARE[i % len(SPARE)] for i, name in enumerate(others)}
     seen: dict[tuple[str, str, float], int] = {}
+    kinds: dict[tuple[str, str], set[tuple[str, ...]]] = {}
+    for rows in ranked:
+        kinds.setdefault((rows[0].task, _label(rows[0])), set()).add(rows[0].options)
     found = []
     for rows in ranked:
         one = rows[0]
         place = (one.task, one.method, one.distance)
         variant = seen[place] = seen.get(place, -1) + 1
-        label = _label(one)
+        label = _label(one, whole=len(kinds[one.task, _label(one)]) > 1)
         if one.budget != _main_budget(groups, one):
             label += f", budget {one.budget}"
         found.append(Group(tuple(rows), label, _shade(colours[one.method], variant)))
@@ -146,14 +161,17 @@ def _main_budget(groups: Sequence[Sequence[Result]], one: Result) -> str:
     return counts.most_common(1)[0][0]
 
 
-def _label(result: Result) -> str:
-    """The method with its options; that it has settings of its own is all that is said of them."""
+def _label(result: Result, *, whole: bool = False) -> str:
+    """The method with its options. Of settings of its own it says that there are some, or `whole`
+    which."""
     options = [
         word.removeprefix("method.") for word in result.options if not word.startswith("task.")
     ]
-    others = any(word.startswith("task.") for word in result.options)
-    tuned = ["tuned" if result.trials else "other settings"] if others else []
-    return ", ".join([result.method, *options, *tuned])
+    others = [word for word in result.options if word.startswith("task.")]
+    if others:
+        said = "tuned" if result.trials else "other settings"
+        options.append(f"{said} ({', '.join(others)})" if whole else said)
+    return ", ".join([result.method, *options])
 
 
 def _shade(colour: str, variant: int) -> str:
@@ -201,39 +219,70 @@ def interval(found: tuple[float, float] | None) -> str:
 
 
 def compare(
-    groups: Sequence[Group], task: str, better: str, worse: str, says: str, *, ties: bool = False
+    groups: Sequence[Group], task: str, better: str, worse: str, says: str
 ) -> Iterator[Claim]:
     """The paper's order of two methods on a task, beside what came out of it.
 
     The order holds where the 95 % interval of the paired difference of `solved_reward`, which ranks
-    the rows, lies above zero, or with `ties` not below it. Without an interval it cannot be told.
+    the rows, lies above zero, and does not where it lies below. Else it cannot be told.
     """
-    first, second = (main_group(groups, task, name) for name in (better, worse))
+    first, second = (papers_group(groups, task, name) for name in (better, worse))
     if first is None or second is None:
         return
     found = difference(first, second, "solved_reward")
-    means = " and ".join(
-        f"{group.label} {np.mean(list(group.values('solved_reward').values())):.3f} "
-        f"({several(len(group.rows), 'seed')})"
-        for group in (first, second)
-    )
-    text = f"{task}: solved reward {means}"
     if found is None:
-        yield Claim(says, f"{text}; no seed in common", None)
         return
-    text += f"; difference {found.mean:.3f}{interval(found.interval)}"
-    holds = None
-    if found.interval is not None:
-        holds = found.interval[1] >= 0.0 if ties else found.interval[0] > 0.0
-    else:
-        text += ", too few seeds for an interval"
-    yield Claim(says, text, holds)
+    one, other = (group.values("solved_reward") for group in (first, second))
+    seeds = one.keys() & other.keys()
+    text = (
+        f"{task}: mean solved reward over {several(len(seeds), 'seed')} of {first.label} "
+        f"{np.mean([one[seed] for seed in seeds]):.3f} and of {second.label} "
+        f"{np.mean([other[seed] for seed in seeds]):.3f}; difference {found.mean:.3f}"
+    )
+    if found.interval is None:
+        yield Claim(says, f"{text}, too few seeds for an interval", Verdict.OPEN)
+        return
+    low, high = found.interval
+    told = Verdict.of(low > 0.0) if low > 0.0 or high < 0.0 else Verdict.OPEN
+    yield Claim(says, text + interval(found.interval), told)
+
+
+def solves(groups: Sequence[Group], says: str, *, good: bool) -> Claim:
+    """Whether a method solves a task as the paper says, or does not (`good`), at each distance.
+
+    A seed succeeds that solves at least `ENOUGH` of the perturbed starts. A method solves the task
+    if at least `ENOUGH` of its seeds succeed, and does not if at least `ENOUGH` of them fail.
+
+    Args:
+        groups: of the method, each at another distance.
+        says: what the paper says.
+        good: whether that is that the method solves it.
+    """
+    told, verdicts = [], set()
+    for group in groups:
+        count = len(group.rows)
+        succeed = sum(row.success >= ENOUGH for row in group.rows)
+        at = f" at {group.first.distance:g} m" if len(groups) > 1 else ""
+        told.append(f"{succeed} of {several(count, 'seed')}{at}")
+        share = (succeed if good else count - succeed) / count
+        if count >= PROVISIONAL_SEEDS:
+            part = Verdict.of(share >= ENOUGH) if not 1 - ENOUGH < share < ENOUGH else Verdict.PART
+            verdicts.add(part)
+    verdict = verdicts.pop() if len(verdicts) == 1 else Verdict.PART if verdicts else Verdict.OPEN
+    found = f"at least {ENOUGH:.0%} of the perturbed starts are solved by {', '.join(told)}"
+    return Claim(says, f"{groups[0].task}, {groups[0].label}: {found}", verdict)
 
 
 def main_group(groups: Sequence[Group], task: str, method: str) -> Group | None:
     """The method's group on a task, of several the one with the most seeds."""
     found = [group for group in groups if (group.task, group.method) == (task, method)]
     return max(found, key=lambda group: len(group.rows)) if found else None
+
+
+def papers_group(groups: Sequence[Group], task: str, method: str) -> Group | None:
+    """The same of the groups with the method as the paper has it; None without one."""
+    options = AS_IN_PAPER.get(method, ())
+    return main_group([one for one in groups if one.first.options == options], task, method)
 
 
 def best_at_hand(results: Results, group: Group) -> Result | None:

@@ -16,6 +16,7 @@ from tsbench.viewer.paper.exhibit import (
     drawing,
     jitter,
     legend,
+    solves,
     tidy,
 )
 
@@ -33,15 +34,18 @@ def exhibits(groups: Sequence[Group]) -> Iterator[Exhibit]:
     with drawing(0.6 + 2.4 * len(ladders)) as figure:
         panels = figure.subplots(len(ladders), 1, squeeze=False)[:, 0]
         for panel, (task, steps) in zip(panels, ladders.items(), strict=True):
-            apart = 0.02 * max(d for by_distance in steps.values() for d in by_distance)
-            for label, by_distance in steps.items():
+            room = 0.02 * max(d for by_distance in steps.values() for d in by_distance)
+            beside = jitter(len(steps), 1.5 * room * (len(steps) - 1))
+            for (label, by_distance), shift in zip(steps.items(), beside, strict=True):
                 colour = next(iter(by_distance.values())).colour
-                means = [float(np.mean(_successes(group))) for group in by_distance.values()]
-                panel.plot(list(by_distance), means, color=colour, lw=2.0, zorder=2)
+                means = {
+                    d: np.mean(_successes(g)) for d, g in by_distance.items() if len(g.rows) > 1
+                }
+                panel.plot(np.array([*means]) + shift, [*means.values()], color=colour, lw=1.5)
                 for distance, group in by_distance.items():
                     found = _successes(group)
-                    x = distance + jitter(len(found), apart)
-                    panel.plot(x, found, "o", color=colour, alpha=0.7, ms=6, mec="white", zorder=3)
+                    x = distance + shift + jitter(len(found), room)
+                    panel.plot(x, found, "o", color=colour, alpha=0.6, ms=6, mec="white")
                     rows += [
                         (task, label, distance, row.seed, row.success, row.command)
                         for row in group.rows
@@ -55,7 +59,8 @@ def exhibits(groups: Sequence[Group]) -> Iterator[Exhibit]:
         name="ladder",
         title="The ladder: probability of success against start distance",
         note="A dot is a seed: the share of perturbed starts that its policy solves; the line is "
-        "the mean over seeds. A seed whose plan fails its audit solves none.",
+        "the mean over several seeds. Methods stand side by side at each distance. A seed "
+        "whose plan fails its audit solves none.",
         figure=figure,
         claims=tuple(_claims(ladders)),
         columns=("task", "method", "distance_m", "seed", "success", "command"),
@@ -77,19 +82,14 @@ def _successes(group: Group) -> list[float]:
 
 
 def _claims(ladders: dict[str, Steps]) -> Iterator[Claim]:
-    for task, steps in ladders.items():
+    for steps in ladders.values():
         for method, says, good in (
-            (MONOLITHIC, "The monolithic formulation fails (at a distance that it leaves out).", 0),
-            (OURS, "Two stages solve the task.", 1),
+            (
+                MONOLITHIC,
+                "The monolithic formulation fails (at a distance that it leaves out).",
+                False,
+            ),
+            (OURS, "Two stages solve the task.", True),
         ):
-            by_distance = steps.get(method)
-            if by_distance:
-                means = {d: float(np.mean(_successes(g))) for d, g in by_distance.items()}
-                told = ", ".join(f"{share:.2f} at {d:g} m" for d, share in means.items())
-                right = {round(share) == good for share in means.values()}
-                yield Claim(
-                    says,
-                    f"{task}: {method} solves {told}"
-                    + ("; it depends on the distance" if len(right) > 1 else ""),
-                    right == {True},
-                )
+            if method in steps:
+                yield solves(list(steps[method].values()), says, good=good)

@@ -16,6 +16,7 @@ from tsbench.viewer.paper.exhibit import (
     Claim,
     Exhibit,
     Group,
+    Verdict,
     best_at_hand,
     drawing,
     main_group,
@@ -91,14 +92,14 @@ def _claims(
         "R is sparse: it is felt only very close to the goal or to obstacles.",
         f"{task}: R exceeds {FELT:.0%} of its largest value on {area:.0%} of the world and along "
         f"{felt[names[0]]:.0%} of the plan's length",
-        max(area, felt[names[0]]) < 0.5,
+        Verdict.of(max(area, felt[names[0]]) < 0.5),
     )
     for name in names[1:]:
         yield Claim(
             "R_imi is dense along the reference motion.",
             f"{task}, {name}: it exceeds {FELT:.0%} of its largest value along {felt[name]:.0%} of "
             "the plan's length",
-            felt[name] > 0.95,
+            Verdict.of(felt[name] > 0.95),
         )
 
 

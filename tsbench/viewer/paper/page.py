@@ -21,7 +21,6 @@ from tsbench.viewer.page import fill
 from tsbench.viewer.paper import ladder, learning, maps, plans, scores, strips, surfaces
 from tsbench.viewer.paper.exhibit import DPI, STYLE, Exhibit, Group, grouped
 
-CLASSES = {True: "holds", False: "differs", None: "open"}  # of claims, in the page's style
 DISTANCE = "task.constants.distance="  # the constant that a ladder changes
 
 
@@ -150,7 +149,7 @@ def _table(lines: Sequence[scores.Line]) -> str:
 def _section(exhibit: Exhibit, picture: bytes) -> str:
     name, data = exhibit.name, base64.b64encode(picture).decode()
     claims = "".join(
-        f'<tr class="{CLASSES[claim.holds]}">'
+        f'<tr class="{claim.verdict.name.lower()}">'
         f"<td>{html.escape(claim.says)}</td><td>{html.escape(claim.found)}</td>"
         f"<td><b>{claim.verdict}</b></td></tr>"
         for claim in exhibit.claims

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsbench.core.task import Task
-from tsbench.core.words import number
+from tsbench.core.words import number, short
 from tsbench.evaluation.statistics import Aggregate, Difference, aggregate, holm
 from tsbench.viewer.paper.exhibit import (
+    ENOUGH,
     OURS,
     Exhibit,
     Group,
@@ -22,7 +23,6 @@ from tsbench.viewer.paper.exhibit import (
     main_group,
     tidy,
 )
-from tsbench.viewer.paper.learning import ENOUGH
 
 LEADING = 2  # of a task's measures, what matters most
 
@@ -39,7 +39,8 @@ class Line:
         succeeding: seeds that solve at least `ENOUGH` of them.
         measures: means of the task's leading measures, over the seeds that have them.
         against: `solved_reward` less that of the two-stage method with the same seeds.
-        p_value: of that, after Holm over the table; None without one.
+        p_value: of that, after Holm over the rows of the table that have an interval; None for
+            the others.
     """
 
     group: Group
@@ -62,8 +63,9 @@ def table(groups: Sequence[Group], tasks: dict[str, Task]) -> list[Line]:
             found = difference(group, ours, "solved_reward")
             if found is not None:
                 against[group] = found
-    corrected = holm({str(i): one.p_value for i, one in enumerate(against.values())})
-    p_values = dict(zip(against, corrected.values(), strict=True))
+    sure = [group for group, one in against.items() if one.interval is not None]
+    corrected = holm({str(i): against[group].p_value for i, group in enumerate(sure)})
+    p_values = dict(zip(sure, corrected.values(), strict=True))
     return [_line(group, tasks, against.get(group), p_values.get(group)) for group in ordered]
 
 
@@ -93,7 +95,7 @@ def _line(
 
 COLUMNS = (
     "task", "method", "seeds", "solved_reward", "normalized_reward", "success",
-    "seeds that succeed", f"less {OURS}", "p (Holm)", "trials", "measures",
+    "seeds that succeed", f"less {OURS}", "p (Holm)", "steps", "trials", "measures",
 )  # fmt: skip
 
 
@@ -103,7 +105,7 @@ def cells(line: Line) -> tuple[str, ...]:
     against, p_value = "", ""
     if line.against is not None:
         against = f"{line.against.mean:+.3f}{interval(line.against.interval)}"
-        if line.against.interval is not None and line.p_value is not None:
+        if line.p_value is not None:
             p_value = f"{line.p_value:.3g}"
     return (
         line.group.task,
@@ -115,6 +117,7 @@ def cells(line: Line) -> tuple[str, ...]:
         f"{line.succeeding} of {count}",
         against,
         p_value,
+        short(round(float(np.mean(list(line.group.values("steps").values()))))),
         str(max(row.trials for row in line.group.rows)),
         "; ".join(f"{name} {number(value)}" for name, value in line.measures.items()),
     )
@@ -125,7 +128,7 @@ def exhibit(groups: Sequence[Group], tasks: dict[str, Task]) -> tuple[Exhibit, l
     lines = table(groups, tasks)
     parts = by_task([line.group for line in lines])
     sizes = [len(members) for members in parts.values()]
-    with drawing(0.5 + sum(0.75 + 0.34 * size for size in sizes)) as figure:
+    with drawing(0.5 + sum(0.75 + 0.4 * size for size in sizes)) as figure:
         panels = figure.subplots(
             len(parts), 1, squeeze=False, gridspec_kw={"height_ratios": [s + 0.5 for s in sizes]}
         )[:, 0]
@@ -133,11 +136,12 @@ def exhibit(groups: Sequence[Group], tasks: dict[str, Task]) -> tuple[Exhibit, l
             for place, group in enumerate(members):
                 line = next(one for one in lines if one.group is group)
                 scores = list(group.values("solved_reward").values())
-                heights = place + jitter(len(scores), 0.45)
+                heights = place - 0.12 + jitter(len(scores), 0.4)
                 panel.plot(scores, heights, "o", color=group.colour, ms=5, alpha=0.6, mec="white")
                 if line.solved.interval is not None:
-                    panel.plot(line.solved.interval, [place] * 2, color=group.colour, lw=4)
-                    panel.plot(line.solved.iqm, place, "D", color=group.colour, mec="black", ms=7)
+                    below = place + 0.27
+                    panel.plot(line.solved.interval, [below] * 2, color=group.colour, lw=3)
+                    panel.plot(line.solved.iqm, below, "D", color=group.colour, mec="black", ms=5)
             panel.set_title(task, loc="left")
             panel.set_yticks(range(len(members)), [group.label for group in members])
             panel.set_ylim(len(members) - 0.5, -0.5)
@@ -156,8 +160,9 @@ def exhibit(groups: Sequence[Group], tasks: dict[str, Task]) -> tuple[Exhibit, l
     shown = Exhibit(
         name="scores",
         title="Scores of every task and method",
-        note="A dot is a training seed, a diamond the interquartile mean over at least ten seeds, "
-        "with its 95 % bootstrap interval. A seed whose plan fails its audit scores zero.",
+        note="A dot is a training seed; the diamond below is the interquartile mean over at least "
+        "ten seeds, with its 95 % bootstrap interval. A seed whose plan fails its audit scores "
+        "zero.",
         figure=figure,
         claims=(),
         columns=(

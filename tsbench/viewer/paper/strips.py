@@ -17,6 +17,7 @@ from tsbench.viewer.paper.exhibit import (
     Claim,
     Exhibit,
     Group,
+    Verdict,
     best_at_hand,
     by_task,
     drawing,
@@ -80,7 +81,8 @@ def _exhibit(task: Task, cast: dict[Group, tuple[Result, Recording]]) -> Exhibit
         title=f"Motions of {task.name} at the same instants",
         note="The best seed at hand of each method, from the task's own start. Below each picture: "
         "the time, and how far the goal still is. Orange discs: feet that press on the ground; "
-        "blue ones: feet that the schedule wants there.",
+        "blue ones: feet that the schedule wants there. On the ground a black ball marks the "
+        "centre of mass, a white one the centre of pressure.",
         figure=figure,
         claims=tuple(_claims(task, cast)),
         columns=("task", "method", "seed", "time_s", "goal_distance_m", "ended"),
@@ -100,7 +102,7 @@ def _claims(task: Task, cast: dict[Group, tuple[Result, Recording]]) -> Iterator
         )
         if group.method == OURS:
             says = "Two stages find a valid, periodic motion."
-            yield Claim(says, told, bool(recording.solved))
+            yield Claim(says, told, Verdict.of(bool(recording.solved)))
         elif group.method == MONOLITHIC:
             says = "The monolithic policy barely balances, without any forward movement."
-            yield Claim(says, told, gone < STILL and not recording.violated)
+            yield Claim(says, told, Verdict.of(gone < STILL and not recording.violated))

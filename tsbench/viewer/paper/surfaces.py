@@ -17,6 +17,7 @@ from tsbench.viewer.paper.exhibit import (
     Claim,
     Exhibit,
     Group,
+    Verdict,
     by_task,
     drawing,
     legend,
@@ -133,5 +134,5 @@ def _claims(scored: dict[Group, list[tuple[Result, Surface]]]) -> Iterator[Claim
             f"{name}: of pushes of {force:.3g} N for 0.1 s {group.label} survives "
             f"{np.mean(survived):.1%} (seeds {min(survived):.1%} to {max(survived):.1%}), and "
             f"solves the task after {recovered:.1%}",
-            min(survived) == 1.0,
+            Verdict.of(min(survived) == 1.0),
         )
