@@ -99,6 +99,8 @@ def _jobs(words: Sequence[str]) -> Iterator[Job]:
     trials = None
     if words and words[0].startswith(TRIALS):
         trials, words = int(words[0].removeprefix(TRIALS)), words[1:]
+        if not words:
+            raise TsbenchError(f"nothing follows {TRIALS}{trials}; words of `tsbench run` should")
     for given in config.sweep(words) if words else ():
         chosen = placed(config.compose(given), given)
         prepare(chosen)
@@ -138,13 +140,18 @@ class Study:
             time.sleep(PAUSE)
 
     def stop(self) -> None:
-        """Lets all trainings save their state, and waits until they have."""
+        """Lets all trainings save their state, waits until they have, and keeps what is finished.
+
+        Raises:
+            TsbenchError: a result cannot be kept.
+        """
         for training in self.running:
             training.process.send_signal(signal.SIGTERM)
         for training in self.running:
             training.process.wait()
+        stopped, self.running = self.running, []
+        for training in stopped:
             self._finish(training)
-        self.running.clear()
 
     def _start(self, job: Job) -> None:
         """Starts a training, unless another process is still at work on it: then it waits."""
@@ -251,8 +258,9 @@ def main(arguments: Sequence[str]) -> int:
         try:
             study.work(max(options.jobs, 1), options.hours)
         except KeyboardInterrupt:
-            study.stop()
             return 130
+        finally:
+            study.stop()
     except TsbenchError as error:
         sys.stderr.write(f"study: {error}\n")
         return 2

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_json
 from tsbench.runs import results
 from tsbench.runs.directory import RunDirectory
@@ -97,13 +98,35 @@ def test_a_mistake_in_a_study_is_told_before_anything_runs(study: Study) -> None
     assert not Path("runs").exists()
 
 
+def test_no_training_is_left_at_work_where_a_result_cannot_be_kept(
+    study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Any] = []
+
+    def start(self: Any, job: Any) -> None:
+        own_start(self, job)
+        begun.extend(self.running[-1:])
+
+    def collect(*_: object) -> None:
+        if len(begun) == 2:
+            raise TsbenchError("the disk is full")
+
+    own_start = STUDY.Study._start
+    monkeypatch.setattr(STUDY.Study, "_start", start)
+    monkeypatch.setattr(results, "of_run", collect)
+    status, _, error = study(f"{NO_WAY} seed=0", "task=laikago_trot method=monolithic")
+    assert (status, error) == (2, "study: the disk is full\n")
+    assert len(begun) == 2
+    assert all(training.process.poll() is not None for training in begun)
+
+
 def test_a_study_names_what_is_left(study: Study) -> None:
     status, told, _ = study(f"{SMALL} 'seed=range(0,2)'", options=("--list",))
     assert status == 0
     assert [line.split("seed=")[1].split()[0] for line in told.splitlines()] == ["0", "1"]
 
 
-@pytest.mark.parametrize("line", ["trials=x task=rocket_navigation", "'"])
+@pytest.mark.parametrize("line", ["trials=x task=rocket_navigation", "trials=3", "'"])
 def test_a_line_that_cannot_be_read_is_named(study: Study, line: str) -> None:
     status, _, error = study("", line)
     assert status == 2

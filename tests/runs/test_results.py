@@ -110,6 +110,25 @@ def test_results_are_read_as_they_were_kept_and_merged_by_their_words(
     assert results.read([out]).rows == merged.rows
 
 
+def test_a_tuned_run_is_kept_whatever_its_settings(
+    tmp_path: Path, invented_record: Callable[[str], Record]
+) -> None:
+    """Its words hold spaces, and are too long for the name of a folder."""
+    settings = [
+        f"task.training.{stage}.{key}=0.123456789012345678"
+        for stage in ("plan", "imitate", "finetune")
+        for key in ("learning_rate", "entropy", "gae_lambda")
+    ]
+    words = [*ROCKET, "task.training.imitate.hidden=[64, 64]", *settings]
+    run, out = begin(tmp_path / "run", words), tmp_path / "results"
+    finish(run, invented_record("rocket_navigation"))
+    kept = results.collect(results.read([run.path]), out, trials=12)
+    loaded = results.load(out)
+    assert loaded.rows == kept.rows
+    assert len(loaded.rows) == 1
+    assert loaded.folders.keys() == loaded.curves.keys() == loaded.rows.keys()
+
+
 def test_the_policies_of_the_best_the_median_and_the_worst_seed_stay(
     tmp_path: Path, invented_record: Callable[[str], Record]
 ) -> None:

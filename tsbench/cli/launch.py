@@ -8,9 +8,7 @@ the words from the command line of the process.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import os
-import re
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -32,7 +30,7 @@ from tsbench.core.files import write_json
 from tsbench.core.lazy import Lazy
 from tsbench.core.words import command
 from tsbench.runs import config
-from tsbench.runs.directory import RunDirectory, shown
+from tsbench.runs.directory import RunDirectory, shown, standard_name
 from tsbench.runs.progress import Output
 from tsbench.runs.schema import ELSEWHERE, RunConfig
 
@@ -43,7 +41,6 @@ else:  # they load torch, so a mistake in the words is told first
     processes, execute = Lazy("tsbench.rl.processes"), Lazy("tsbench.runs.execute")
 
 RUNS = Path("runs")
-LONGEST_NAME = 48  # characters of a run directory's name, without its hash
 CHECKED_JOBS = 1000  # jobs of a sweep checked before it starts; later ones when they start
 PART_OF_THE_NAME = ("task", "method", "seed", "budget", *ELSEWHERE)
 RESUME = "resume="
@@ -127,18 +124,10 @@ def placed(chosen: RunConfig, words: Sequence[str]) -> RunConfig:
 
 
 def directory(chosen: RunConfig, words: Sequence[str]) -> Path:
-    """The standard run directory. Words that change other keys are part of its name: the ends of
-    their keys and their values, as far as there is room, and a hash of them all."""
-    name = f"seed{chosen.seed}-{chosen.budget}"
-    others = [word.lstrip("+") for word in _own(words)]
-    others = sorted(one for one in others if one.split("=")[0].strip("~") not in PART_OF_THE_NAME)
-    for word in others:
-        key, separator, value = word.partition("=")
-        short = f",{key.rpartition('.')[2]}{separator}{value}"
-        name += re.sub(r"[^\w.=,-]+", "_", short)
-    if others:
-        mark = hashlib.sha256("\n".join(others).encode()).hexdigest()[:8]
-        name = f"{name[:LONGEST_NAME].rstrip(',=')}-{mark}"
+    """The standard run directory. Words that change other keys are part of its name."""
+    plain = [word.lstrip("+") for word in _own(words)]
+    others = [word for word in plain if word.split("=")[0].strip("~") not in PART_OF_THE_NAME]
+    name = standard_name(chosen.seed, chosen.budget, others)
     return RUNS / chosen.task.name / str(chosen.method["name"]) / name
 
 

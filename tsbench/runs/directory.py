@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -47,6 +49,7 @@ METRICS = "metrics.jsonl"
 LOG = "log.txt"
 EVENTS = "tensorboard"
 CHECKPOINTS = "checkpoints"
+LONGEST_NAME = 48  # characters of a run directory's name, without its hash
 
 
 @dataclass
@@ -105,6 +108,20 @@ class Record:
     def as_dict(self) -> dict[str, Any]:
         """The record as JSON holds it."""
         return {**asdict(self), "score": self.score.as_dict()}
+
+
+def standard_name(seed: int, budget: str, others: Collection[str]) -> str:
+    """The name of a run's directory among those of its task and method. Other words of its command
+    are part of it: the ends of their keys and their values, as far as there is room, and a hash of
+    them all."""
+    name, others = f"seed{seed}-{budget}", sorted(others)
+    if not others:
+        return name
+    for word in others:
+        key, separator, value = word.partition("=")
+        name += re.sub(r"[^\w.=,-]+", "_", f",{key.rpartition('.')[2]}{separator}{value}")
+    mark = hashlib.sha256("\n".join(others).encode()).hexdigest()[:8]
+    return f"{name[:LONGEST_NAME].rstrip(',=')}-{mark}"
 
 
 def _there(path: Path) -> bool:

@@ -123,13 +123,15 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The git commit of tsbench's checkout, with "+" if files were changed; None without git."""
+    """The git commit of tsbench's checkout, with "+" if a file of the package or a model was
+    changed; None without git."""
     root = PACKAGE.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
         return None
     git = ["git", "-C", str(root)]
     commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True)
-    changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True)
+    status = [*git, "status", "--porcelain", "--", PACKAGE.name, "models"]
+    changes = subprocess.run(status, capture_output=True, text=True)
     if commit.returncode:
         return None
     return commit.stdout.strip() + ("+" if changes.stdout else "")

@@ -16,7 +16,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import re
 import shlex
 import shutil
 import zipfile
@@ -32,7 +31,14 @@ from tsbench.core.files import parse_json, read_file, write_whole
 from tsbench.core.typed import typed
 from tsbench.core.words import command
 from tsbench.evaluation.score import Score
-from tsbench.runs.directory import MAX_SCORE, RunDirectory, Stage, read_metrics, thin
+from tsbench.runs.directory import (
+    MAX_SCORE,
+    RunDirectory,
+    Stage,
+    read_metrics,
+    standard_name,
+    thin,
+)
 from tsbench.runs.schema import ELSEWHERE, RunConfig
 
 ROWS = "runs.jsonl"
@@ -324,7 +330,7 @@ def _load_curves(path: Path) -> dict[tuple[str, ...], tuple[Curve, ...]]:
     try:
         with np.load(content, allow_pickle=False) as file:
             for name in file.files:
-                *words, stage = name.split(" ")
+                *words, stage = shlex.split(name)
                 curve = Curve(stage, *file[name])
                 found[tuple(words)] = (*found.get(tuple(words), ()), curve)
     except (OSError, ValueError, TypeError, EOFError, KeyError, zipfile.BadZipFile) as error:
@@ -357,7 +363,7 @@ def collect(new: Results, place: Path, trials: int | None = None) -> Results:
         for group in found.groups():
             _keep_policies(found, group, place / POLICIES)
         arrays = {
-            " ".join([*words, curve.stage]): np.stack([curve.steps, curve.seconds, curve.returns])
+            shlex.join([*words, curve.stage]): np.stack([curve.steps, curve.seconds, curve.returns])
             for words, curves in sorted(found.curves.items())
             for curve in curves
         }
@@ -410,5 +416,4 @@ def _keep_policies(found: Results, group: Sequence[Result], policies: Path) -> N
 
 
 def _folder(row: Result) -> Path:
-    name = ",".join([f"seed{row.seed}-{row.budget}", *row.words[4:]])
-    return Path(row.task, row.method, re.sub(r"[^\w.=,-]+", "_", name))
+    return Path(row.task, row.method, standard_name(row.seed, row.budget, row.words[4:]))
