@@ -14,11 +14,14 @@ import sys
 import sysconfig
 import venv
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+
+from tsbench.rl.stages import ImitationOptions
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "planar-puck"
@@ -60,6 +63,13 @@ def test_the_guide_shows_the_file(name: str) -> None:
     for piece in shown:
         assert f"\n{piece}" in f"\n{source}"
     assert written("".join(shown)) == written(source)
+
+
+def test_a_planner_that_imitates_has_the_options_of_imitation() -> None:
+    """Its own tests hold it to that, and need OMPL."""
+    folder = ROOT / "examples" / "planner-ompl" / "planner_ompl"
+    settings = yaml.safe_load((folder / "conf" / "method" / "ompl.yaml").read_text("utf-8"))
+    assert {field.name for field in fields(ImitationOptions)} <= settings.keys()
 
 
 def test_the_guide_shows_no_other_file() -> None:

@@ -61,7 +61,7 @@ def test_a_run_has_its_roadmap(tmp_path: Path) -> None:
 
 def test_options_change_the_plan(tmp_path: Path) -> None:
     plans = []
-    for options in ({}, {"samples": 500}, {"shortcut": False}, {"neighbours": 5}):
+    for options in ({}, {"samples": 500}, {"shortcut": True}, {"neighbours": 5}):
         prm.train(problem("rocket_obstacles", **options), Desk(tmp_path))
         plans.append(Plan.load(tmp_path / "plan.npz").states.tobytes())
     assert len(set(plans)) == 4

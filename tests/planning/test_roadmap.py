@@ -118,8 +118,8 @@ def test_shortcuts_round_a_corner() -> None:
     """The best way touches the wall's end at (5, 8): sqrt(4^2 + 7^2) + sqrt(4^2 + 1) = 12.185."""
     space = Plane(wall=True)
     best = (np.sqrt(65.0) + np.sqrt(17.0)) / 0.5
-    rough = find_route(space, 2000, 16, 0, shortcut=False)
-    route = find_route(space, 2000, 16, 0)
+    rough = find_route(space, 2000, 16, 0)
+    route = find_route(space, 2000, 16, 0, shortcut=True)
     assert best <= route.steps <= 1.02 * best
     assert route.steps < rough.steps < 1.1 * best
     assert space.free(route.corners[:-1], route.corners[1:]).all()

@@ -31,14 +31,14 @@ class Options(ImitationOptions):
         the phase of the gait, which needs no samples.
     samples: Halton samples of a blind roadmap.
     neighbours: nearest samples that each of them is joined to.
-    shortcut: whether the way through a blind roadmap is straightened.
+    shortcut: whether the way through a blind roadmap is straightened; the paper's is not.
     """
 
     audit: str | None = "warn"
     roadmap: str = "blind"
     samples: int = 2000
     neighbours: int = 16
-    shortcut: bool = True
+    shortcut: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

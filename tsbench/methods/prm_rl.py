@@ -55,7 +55,7 @@ class Options:
     samples: Halton samples of the roadmap.
     neighbours: nearest samples that each of them is joined to.
     reach: length of an edge at most, in plan steps; from as far away driving is learned.
-    rollouts: how often an edge is driven, half of them from rest.
+    rollouts: how often an edge is driven: once from the nominal start, else from perturbed ones.
     least: lower Wilson bound of an edge's success that keeps it.
     drive: share of the physics budget spent on learning to drive.
     test: share spent on driving edges; the rest is for distilling.

@@ -96,7 +96,7 @@ def halton(low: np.ndarray, high: np.ndarray, count: int, seed: int) -> np.ndarr
 
 
 def find_route(
-    space: RoadmapSpace[Any], samples: int, neighbours: int, seed: int, *, shortcut: bool = True
+    space: RoadmapSpace[Any], samples: int, neighbours: int, seed: int, *, shortcut: bool = False
 ) -> Route:
     """The quickest way through a roadmap.
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from ompl import base, geometric, util
 
-from tsbench.core.errors import TsbenchError
+from tsbench.core.errors import PlanError
 from tsbench.core.method import Problem, Workspace
 from tsbench.core.policy import Policy
 from tsbench.core.roadmap import RoadmapSpace
 from tsbench.core.task import roadmap_space
 from tsbench.methods import options
 from tsbench.planning.roadmap import resampled
-from tsbench.rl.stages import ImitationOptions, learn_imitation
+from tsbench.rl.stages import AFTER_IMITATION, ImitationOptions, learn_imitation
 from tsbench.sim.kinematic import plan_along
 
-STAGES = ("imitate", "finetune")
+STAGES = ("imitate", *AFTER_IMITATION)
 PLANNERS = ("BITstar", "RRTstar", "PRMstar")
 
 
@@ -74,7 +74,8 @@ class Ways:
         setup.setPlanner(getattr(geometric, planner)(information))
         setup.solve(enough)
         if not setup.haveExactSolutionPath():
-            raise TsbenchError(f"{planner} found no way to the goal: more method.edges are needed")
+            more = "method.seconds" if planner == "PRMstar" else "method.edges"
+            raise PlanError(f"{planner} found no way to the goal: more {more} are needed")
         return np.array([self.point(at) for at in setup.getSolutionPath().getStates()])
 
     def free(self, first: Any, second: Any) -> bool:

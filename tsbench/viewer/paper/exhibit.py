@@ -24,8 +24,6 @@ from tsbench.runs.results import Result, Results
 # because the figures tell what the paper claims of these four, most often of two of them together.
 # Any other method needs no line: it has its own name and a spare colour.
 OURS, MONOLITHIC, PRM, PRM_RL = "twostage", "monolithic", "prm", "prm_rl"
-# What makes a method the paper's where its defaults do not: the paper's roadmap has no shortcuts.
-AS_IN_PAPER = {PRM: ("method.shortcut=false",)}
 
 # Colours of Okabe and Ito's palette, which colour-blind readers can tell apart. A method has the
 # same one in every figure; one that is not of the paper has a spare one.
@@ -280,9 +278,8 @@ def main_group(groups: Sequence[Group], task: str, method: str) -> Group | None:
 
 
 def papers_group(groups: Sequence[Group], task: str, method: str) -> Group | None:
-    """The same of the groups with the method as the paper has it; None without one."""
-    options = AS_IN_PAPER.get(method, ())
-    return main_group([one for one in groups if one.first.options == options], task, method)
+    """The same of the groups with the method's defaults, as the paper has it; None without one."""
+    return main_group([one for one in groups if not one.first.options], task, method)
 
 
 def best_at_hand(results: Results, group: Group) -> Result | None:
