@@ -212,8 +212,13 @@ def difference(first: Group, second: Group, name: str) -> Difference | None:
     return paired_difference({"": {s: one[s] for s in seeds}}, {"": {s: other[s] for s in seeds}})
 
 
+def fixed(value: float) -> str:
+    """With three decimals, and without the sign of a zero."""
+    return f"{round(value, 3) + 0.0:.3f}"
+
+
 def interval(found: tuple[float, float] | None) -> str:
-    return "" if found is None else f" [{found[0]:.3f}, {found[1]:.3f}]"
+    return "" if found is None else f" [{fixed(found[0])}, {fixed(found[1])}]"
 
 
 def compare(

@@ -52,6 +52,7 @@ def exhibits(groups: Sequence[Group]) -> Iterator[Exhibit]:
                     ]
             panel.set_title(task, loc="left")
             panel.set(ylim=(-0.05, 1.05), ylabel="starts solved")
+            panel.set_xticks(sorted({d for by_distance in steps.values() for d in by_distance}))
             tidy(panel)
         panels[-1].set_xlabel("distance of the goal from the start, m")
         legend(figure, shown)

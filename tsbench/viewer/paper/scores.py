@@ -18,6 +18,7 @@ from tsbench.viewer.paper.exhibit import (
     by_task,
     difference,
     drawing,
+    fixed,
     interval,
     jitter,
     main_group,
@@ -104,15 +105,15 @@ def cells(line: Line) -> tuple[str, ...]:
     count = len(line.group.rows)
     against, p_value = "", ""
     if line.against is not None:
-        against = f"{line.against.mean:+.3f}{interval(line.against.interval)}"
+        against = f"{round(line.against.mean, 3) + 0.0:+.3f}{interval(line.against.interval)}"
         if line.p_value is not None:
             p_value = f"{line.p_value:.3g}"
     return (
         line.group.task,
         line.group.label,
         str(count) if line.solved.standing == "ranked" else f"{count}, {line.solved.standing}",
-        f"{line.solved.iqm:.3f}{interval(line.solved.interval)}",
-        f"{line.normalized.iqm:.3f}{interval(line.normalized.interval)}",
+        f"{fixed(line.solved.iqm)}{interval(line.solved.interval)}",
+        f"{fixed(line.normalized.iqm)}{interval(line.normalized.interval)}",
         f"{line.success:.2f}",
         f"{line.succeeding} of {count}",
         against,
