@@ -91,6 +91,22 @@ def test_a_method_has_one_colour_and_its_variants_paler_ones(make: Callable[...,
     assert len(set(colours)) == 5
 
 
+def test_a_variant_has_one_colour_in_all_tasks(make: Callable[..., Result]) -> None:
+    """Also where a task has other variants of the method, or none without options."""
+    other = replace(make(PRM, 0, 0.1, 1.0, "method.shortcut=true"), task="rocket_obstacles")
+    rows = [
+        make(PRM, 0, 0.1), make(PRM, 0, 0.1, 1.0, "method.roadmap=layered"),
+        make(PRM, 0, 0.1, 1.0, "method.shortcut=true"),
+        replace(other, words=("task=rocket_obstacles", *other.words[1:])),
+    ]  # fmt: skip
+    colours: dict[str, set[str]] = {}
+    for group in grouped(of(rows).groups()):
+        colours.setdefault(group.label, set()).add(group.colour)
+    assert [len(found) for found in colours.values()] == [1, 1, 1]
+    assert len(set.union(*colours.values())) == 3
+    assert colours[PRM] == {COLOURS[PRM]}
+
+
 def test_variants_of_a_method_are_told_apart(make: Callable[..., Result]) -> None:
     few, many = "task.training.imitate.epochs=2", "task.training.imitate.epochs=8"
     (group,) = grouped(of([make(OURS, 0, 0.1, 1.0, few)]).groups())

@@ -130,22 +130,29 @@ class Group:
 def grouped(groups: Sequence[Sequence[Result]]) -> list[Group]:
     """The groups with labels and colours: the paper's methods first, then the others by name."""
     order = {method: rank for rank, method in enumerate(COLOURS)}
-    ranked = sorted(groups, key=lambda rows: (order.get(rows[0].method, len(order)), rows[0].kind))
+    ranked = sorted(
+        groups,
+        key=lambda rows: (
+            order.get(rows[0].method, len(order)), bool(rows[0].options), rows[0].kind
+        ),
+    )  # fmt: skip
     others = sorted({rows[0].method for rows in groups} - COLOURS.keys())
     colours = COLOURS | {name: SPARE[i % len(SPARE)] for i, name in enumerate(others)}
-    seen: dict[tuple[str, str, float], int] = {}
+    variants: dict[str, list[str]] = {}  # labels of each method, the same in all tasks
     kinds: dict[tuple[str, str], set[tuple[str, ...]]] = {}
     for rows in ranked:
         kinds.setdefault((rows[0].task, _label(rows[0])), set()).add(rows[0].options)
     found = []
     for rows in ranked:
         one = rows[0]
-        place = (one.task, one.method, one.distance)
-        variant = seen[place] = seen.get(place, -1) + 1
         label = _label(one, whole=len(kinds[one.task, _label(one)]) > 1)
         if one.budget != _main_budget(groups, one):
             label += f", budget {one.budget}"
-        found.append(Group(tuple(rows), label, _shade(colours[one.method], variant)))
+        known = variants.setdefault(one.method, [])
+        if label not in known:
+            known.append(label)
+        colour = _shade(colours[one.method], known.index(label))
+        found.append(Group(tuple(rows), label, colour))
     return found
 
 
