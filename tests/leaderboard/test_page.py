@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tsbench import cli
+from tsbench.core.errors import TsbenchError
 from tsbench.core.files import encode_json
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import V1
@@ -100,6 +101,17 @@ def site(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     page.write_site(board, folder, lambda run: f"<p>{run.path.name}</p>", lambda line: None)
     return folder
+
+
+def test_a_site_replaces_an_earlier_one_and_no_other_files(board: Path, tmp_path: Path) -> None:
+    for _ in range(2):
+        page.write_site(board, tmp_path / "site", None, lambda line: None)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "index.html").write_text("mine")
+    for place in (tmp_path / "mine", tmp_path / "mine" / "index.html"):
+        with pytest.raises(TsbenchError, match="nothing is overwritten: give another folder"):
+            page.write_site(board, place, None, lambda line: None)
+    assert (tmp_path / "mine" / "index.html").read_text() == "mine"
 
 
 def test_texts_of_an_entry_are_nothing_but_text(site: Path) -> None:

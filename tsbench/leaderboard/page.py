@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
-from tsbench.core.files import write_whole
+from tsbench.core.files import taken, write_whole
 from tsbench.core.words import duration, number
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import stored
@@ -34,6 +34,7 @@ from tsbench.leaderboard.verify import (
 )
 from tsbench.runs.directory import RunDirectory
 
+MARK = b'<meta name="generator" content="tsbench leaderboard">'  # of the pages of a site
 Report = Callable[[RunDirectory], str]  # makes the page of a training: 3-D view and figures
 
 STANDINGS = {
@@ -244,7 +245,7 @@ def write_site(
 ) -> list[Path]:
     """Writes the site: `index.html`, and for each entry a page, its manifest and its reports.
 
-    Files of an earlier site are replaced.
+    Files of an earlier site are replaced, and those of nobody else.
 
     Args:
         board: with the entries.
@@ -256,8 +257,13 @@ def write_site(
         The files.
 
     Raises:
-        TsbenchError: a file cannot be written, or a verdict is damaged.
+        TsbenchError: the folder holds other files, one cannot be written, or a verdict is damaged.
     """
+    with os_errors(folder):
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            earlier = folder / "index.html"
+            if not (earlier.is_file() and MARK in earlier.read_bytes()[:2000]):
+                raise taken(folder, "other files", "give another folder by --html DIR")
     found, left_out = tables(board)
     templates = _templates()
     written: dict[Path, bytes] = {}
