@@ -17,7 +17,8 @@ from tsbench.runs.directory import RunDirectory
 BOARDS = Path(__file__).parents[2] / "leaderboards"
 ENTRIES = sorted(path.parent for path in BOARDS.glob("v1/*/*/*/policy.json"))
 NAMES = [str(entry.relative_to(BOARDS)) for entry in ENTRIES]
-FIRST = list({str(path.parent): path for path in reversed(ENTRIES)}.values())  # of each method
+# A training of each entry.
+FIRST = list({path.parent: path for path in reversed(ENTRIES)}.values())
 
 
 def test_entries_are_of_tasks() -> None:

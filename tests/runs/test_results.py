@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_json
-from tsbench.runs import config, results
+from tsbench.runs import config, provenance, results
 from tsbench.runs.directory import POINTS, Record, RunDirectory
 from tsbench.runs.execute import prepare
 from tsbench.runs.provenance import write_provenance
@@ -79,6 +80,25 @@ def test_a_finished_run_is_kept_with_its_words_distance_and_thin_curves(
     (curve,) = found.curves[row.words]
     assert len(curve.steps) == POINTS
     assert (curve.steps[0], curve.steps[-1], curve.returns[-1]) == (10, 10_000, 1)
+
+
+def test_a_commit_is_marked_by_changes_of_the_package_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not by the results, which a study writes after each run."""
+    package = tmp_path / "tsbench"
+    for folder in (package, tmp_path / "models", tmp_path / "results"):
+        folder.mkdir()
+        (folder / "file").write_text("before")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=A", "-c", "user.email=a@example.org"]
+    for words in (["init", "-q"], ["add", "-A"], ["commit", "-q", "-m", "all"]):
+        subprocess.run([*git, *words], check=True)
+    monkeypatch.setattr(provenance, "PACKAGE", package)
+    marks = []
+    for name in ("results/file", "results/new", "models/file"):
+        (tmp_path / name).write_text("after")
+        marks.append((provenance._commit() or "")[40:])
+    assert marks == ["", "", "+"]
 
 
 def test_a_plan_that_fails_is_a_result_of_zero(tmp_path: Path) -> None:

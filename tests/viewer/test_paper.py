@@ -17,12 +17,14 @@ from matplotlib.colors import to_hex
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import Plan
-from tsbench.core.task import plannable
+from tsbench.core.task import plannable, roadmap_space
+from tsbench.planning.roadmap import find_route
 from tsbench.runs import config, results
 from tsbench.runs.directory import Record, RunDirectory, Stage
 from tsbench.runs.execute import prepare
 from tsbench.runs.provenance import write_provenance
 from tsbench.runs.results import Curve, Result, Results
+from tsbench.sim.kinematic import naive_plan, plan_along
 from tsbench.viewer.paper import ladder, learning, maps, page, plans, scores
 from tsbench.viewer.paper.exhibit import (
     COLOURS,
@@ -222,6 +224,30 @@ def test_how_smooth_a_plan_is_by_hand(make: Callable[..., Result]) -> None:
     corner = way(np.zeros(2), np.array([goal[0], 0.0]), goal)
     assert corner.turning * corner.length == pytest.approx(math.pi / 2, abs=1e-6)
     assert corner.roughness > 1.0
+
+
+def test_the_footsteps_of_a_plan_by_hand(make: Callable[..., Result]) -> None:
+    """The hand-made trot steps evenly; the way through a roadmap does not."""
+    task = plannable(tasks.make("laikago_trot"))
+    plan = naive_plan(task)
+    reference = task.reference(plan)
+    even = plans.step_lengths(plan, reference)
+    feet = reference.tracked["feet"].copy()
+    swayed = replace(reference, tracked={**reference.tracked, "feet": feet})
+    feet[..., 0] += 0.05 * np.sin(2.0 * reference.times)[:, None]
+    assert len(even) > 8
+    assert even.mean() == pytest.approx(0.34, abs=0.02)
+    assert np.std(plans.step_lengths(plan, swayed)) > np.std(even) + 0.01
+    stood = {**reference.tracked, "contacts": np.ones_like(reference.tracked["contacts"])}
+    assert len(plans.step_lengths(plan, replace(reference, tracked=stood))) == 0
+
+    space = roadmap_space(task, PRM)
+    rough = plan_along(task, space, find_route(space, 500, 16, seed=0).points)
+    ours, prm = grouped(of([make(OURS, 0, 0.5), make(PRM, 0, 0.5)]).groups())
+    for theirs, verdict in ((rough, Verdict.HOLDS), (plan, Verdict.DIFFERS)):
+        ways = {g: [plans.way(task, p, g, 0)] for g, p in ((ours, plan), (prm, theirs))}
+        (claim,) = plans._claims(task, ways)
+        assert claim.verdict is verdict
 
 
 def test_the_printed_imitation_reward_is_as_sparse_as_the_task_s(

@@ -241,6 +241,8 @@ def compare(
         return
     found = difference(first, second, "solved_reward")
     if found is None:
+        text = f"{task}: {first.label} and {second.label} have no seed in common"
+        yield Claim(says, text, Verdict.OPEN)
         return
     one, other = (group.values("solved_reward") for group in (first, second))
     seeds = one.keys() & other.keys()
@@ -275,9 +277,14 @@ def solves(groups: Sequence[Group], says: str, *, good: bool) -> Claim:
         at = f" at {group.first.distance:g} m" if len(groups) > 1 else ""
         told.append(f"{succeed} of {several(count, 'seed')}{at}")
         share = (succeed if good else count - succeed) / count
-        if count >= PROVISIONAL_SEEDS:
-            part = Verdict.of(share >= ENOUGH) if not 1 - ENOUGH < share < ENOUGH else Verdict.PART
-            verdicts.add(part)
+        if count < PROVISIONAL_SEEDS:
+            continue
+        if share >= ENOUGH:
+            verdicts.add(Verdict.HOLDS)
+        elif share <= 1.0 - ENOUGH:
+            verdicts.add(Verdict.DIFFERS)
+        else:
+            verdicts.add(Verdict.PART)
     verdict = verdicts.pop() if len(verdicts) == 1 else Verdict.PART if verdicts else Verdict.OPEN
     found = f"at least {ENOUGH:.0%} of the perturbed starts are solved by {', '.join(told)}"
     return Claim(says, f"{groups[0].task}, {groups[0].label}: {found}", verdict)

@@ -188,7 +188,10 @@ def _regular(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Cla
     for members in (theirs, ours):
         motions = [(one.plan, task.reference(one.plan)) for one in members]
         passed = sum(task.audit(*motion).passed for motion in motions)
-        spread = float(np.mean([np.std(step_lengths(*motion)) for motion in motions]))
+        lengths = [found for motion in motions if len(found := step_lengths(*motion))]
+        if not lengths:
+            return  # these plans do not take a step
+        spread = float(np.mean([np.std(found) for found in lengths]))
         label = members[0].group.label
         told.append(
             f"{1e3 * spread:.0f} mm in plans of {label}, of which {passed} of {len(motions)} pass "
