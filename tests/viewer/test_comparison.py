@@ -6,12 +6,14 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tsbench import cli
 from tsbench.core.errors import TsbenchError
+from tsbench.evaluation.protocol import SMOKE, V1
 from tsbench.runs.directory import Record, Stage
 from tsbench.runs.results import Curve, Result, Results
 from tsbench.viewer import comparison
@@ -24,6 +26,7 @@ ROOT = Path(__file__).parents[2]
 def made_fixture(invented_record: Callable[[str], Record]) -> Callable[..., Results]:
     """A function from scores by method and seed to results with these."""
     score = invented_record(TASK).score
+    score = replace(score, protocol=V1.name, origin=replace(score.origin, protocol=V1))
 
     def made(**methods: dict[int, float]) -> Results:
         found = Results()
@@ -59,6 +62,32 @@ def test_pairs_without_a_common_seed(made: Callable[..., Results]) -> None:
     (pair,) = comparison.pairs(made(prm={1: 0.9}, other={1: 0.1}))
     assert pair.difference is not None
     assert pair.p_value is None  # nothing can be told from one seed
+
+
+def test_scores_that_differ_in_kind_are_not_compared(made: Callable[..., Results]) -> None:
+    """Of a longer way, of another protocol, and of failed plans, which count everywhere."""
+    found = made(prm={0: 0.9}, far={0: 0.5}, failed={0: 0.0}, smoke={0: 0.4})
+
+    def change(method: str, *more: str, **origin: Any) -> None:
+        (row,) = (row for row in found.rows.values() if row.method == method)
+        del found.rows[row.words]
+        assert row.score is not None
+        score = replace(row.score, origin=replace(row.score.origin, **origin))
+        changed = replace(row, words=(*row.words, *more), score=score)
+        found.rows[changed.words] = changed
+
+    change("far", "task.constants.distance=80", constants="0" * 64)
+    change("smoke", protocol=SMOKE)
+    (row,) = (row for row in found.rows.values() if row.method == "failed")
+    found.rows[row.words] = replace(row, score=None, failure="no way")
+    names = comparison.names(found)
+    assert {names[words] for words in found.rows} == {
+        "prm", "far, distance=80", "smoke, protocol smoke", "failed"
+    }  # fmt: skip
+    assert comparison.incomparable(found)
+    assert {frozenset((pair.first, pair.second)) for pair in comparison.pairs(found)} == {
+        frozenset((name, "failed")) for name in ("prm", "far, distance=80", "smoke, protocol smoke")
+    }
 
 
 def test_p_values_are_adjusted_for_the_number_of_pairs(made: Callable[..., Results]) -> None:
@@ -97,6 +126,14 @@ def test_compare_kept_entries(
     assert "rocket_navigation, seed by seed" in text
     assert "twostage less prm" in text
     assert (tmp_path / "found.json").exists()
+    assert "are not compared" not in text
+    monkeypatch.setenv("COLUMNS", "120")
+    assert cli.main(["compare", str(ROOT / "results" / "paper")]) == 0
+    text = capsys.readouterr().out
+    rows = [line for line in text.partition("seed by seed")[0].splitlines() if ", seed " in line]
+    assert any("prm, shortcut=true, seed 3" in row for row in rows)
+    assert any("twostage, distance=24" in row for row in text.splitlines())
+    assert "versions or constants of a task are not compared" in text
     kept = ROOT / "leaderboards" / "v1" / "rocket_navigation" / "prm"
     bare = [shutil.copytree(one, tmp_path / one.name) for one in sorted(kept.glob("seed*"))[:2]]
     for folder in bare:

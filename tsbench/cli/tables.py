@@ -114,17 +114,23 @@ def show_scores(console: Console, lines: Sequence[scores.Line]) -> None:
         console.print(table)
 
 
-def show_runs(console: Console, runs: Mapping[str, Results]) -> None:
+def show_runs(
+    console: Console, runs: Mapping[str, Results], names: Mapping[tuple[str, ...], str]
+) -> None:
     """Prints a row for each run: its figures and what it used.
 
     Args:
         console: the terminal.
         runs: what was found under each word of the command line.
+        names: of each run's group, by the words of the run.
     """
     rows: dict[str, list[Sequence[str]]] = {}
     for word, found in runs.items():
         for row in found.rows.values():
-            label = word if len(found.rows) == 1 else f"{word} seed {row.seed}"
+            label = word
+            if len(found.rows) > 1:
+                folder = f"{word}: " if len(runs) > 1 else ""
+                label = f"{folder}{names[row.words]}, seed {row.seed}"
             seconds = sum(stage.seconds for stage in row.stages)
             solved, survived = "no policy", "-"
             if row.score is not None:
@@ -139,9 +145,15 @@ def show_runs(console: Console, runs: Mapping[str, Results]) -> None:
         show_rows(console, headers, members, title=task)
 
 
-def show_pairs(console: Console, pairs: Sequence[Pair]) -> None:
+def show_pairs(console: Console, pairs: Sequence[Pair], *, incomparable: bool) -> None:
     """Prints the differences of `solved_reward` between groups of runs, and how sure they are. One
-    or two seeds say nothing of the methods, so their mean is not shown."""
+    or two seeds say nothing of the methods, so their mean is not shown.
+
+    Args:
+        console: the terminal.
+        pairs: of groups of one task.
+        incomparable: whether others were left out.
+    """
     rows: dict[str, list[Sequence[str]]] = {}
     for pair in pairs:
         mean = interval = "-"
@@ -158,6 +170,9 @@ def show_pairs(console: Console, pairs: Sequence[Pair]) -> None:
     if any(pair.difference is None or pair.difference.interval is None for pair in pairs):
         line = f"Over the seeds that both have; a mean needs {PROVISIONAL_SEEDS} of them, "
         line += f"an interval {RANKED_SEEDS}."
+        console.print(line, highlight=False)
+    if incomparable:
+        line = "Scores by other protocols, versions or constants of a task are not compared."
         console.print(line, highlight=False)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -10,10 +11,11 @@ import matplotlib
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError
+from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.statistics import Difference, holm
-from tsbench.runs.results import Results
+from tsbench.runs.results import CONSTANTS, Results
 from tsbench.viewer.paper import learning
-from tsbench.viewer.paper.exhibit import DPI, STYLE, by_task, difference, grouped
+from tsbench.viewer.paper.exhibit import DPI, STYLE, Group, by_task, difference, grouped
 
 FIGURE = "solved_reward"  # that is compared
 
@@ -41,12 +43,24 @@ class Pair:
     p_value: float | None
 
 
+def names(results: Results) -> dict[tuple[str, ...], str]:
+    """What tells a run's group from the others of its task, by the words of each run."""
+    return {row.words: _name(group) for group in grouped(results.groups()) for row in group.rows}
+
+
+def _name(group: Group) -> str:
+    constants = [word.removeprefix(CONSTANTS) for word in group.first.words if CONSTANTS in word]
+    others = sorted({protocol for protocol, _, _ in _scored(group)} - {V1.name})
+    return ", ".join([group.label, *constants, *(f"protocol {other}" for other in others)])
+
+
 def pairs(results: Results) -> list[Pair]:
-    """Every pair of groups of one task."""
+    """Every pair of groups of one task that can be compared: with scores by one protocol, of the
+    same task and constants. A run without a policy is worth zero by all of them."""
     found = [
         (one, other, len(one.values(FIGURE).keys() & other.values(FIGURE).keys()))
-        for members in by_task(grouped(results.groups())).values()
-        for one, other in combinations(members, 2)
+        for one, other in _possible(results)
+        if len(_scored(one) | _scored(other)) < 2
     ]
     differences = [difference(one, other, FIGURE) for one, other, _ in found]
     tested = {
@@ -56,9 +70,27 @@ def pairs(results: Results) -> list[Pair]:
     }
     adjusted = holm(tested)
     return [
-        Pair(one.task, one.label, other.label, seeds, differences[place], adjusted.get(str(place)))
+        Pair(
+            one.task, _name(one), _name(other), seeds, differences[place], adjusted.get(str(place))
+        )
         for place, (one, other, seeds) in enumerate(found)
     ]
+
+
+def incomparable(results: Results) -> bool:
+    """Whether groups of one task are left out of `pairs` since their scores differ in kind."""
+    return any(len(_scored(one) | _scored(other)) > 1 for one, other in _possible(results))
+
+
+def _possible(results: Results) -> Iterator[tuple[Group, Group]]:
+    for members in by_task(grouped(results.groups())).values():
+        yield from combinations(members, 2)
+
+
+def _scored(group: Group) -> set[tuple[str, int, str]]:
+    """Protocols, versions and constants of the scores of a group's runs."""
+    origins = [row.score.origin for row in group.rows if row.score]
+    return {(one.protocol.name, one.task_version, one.constants) for one in origins}
 
 
 def picture(results: Results) -> bytes:

@@ -29,8 +29,9 @@ def call(words: Sequence[str]) -> None:
     for part in parts:
         everything.update(part)
     console, pairs = Console(), comparison.pairs(everything)
-    tables.show_runs(console, dict(zip(options.runs, parts, strict=True)))
-    tables.show_pairs(console, pairs)
+    names = comparison.names(everything)
+    tables.show_runs(console, dict(zip(options.runs, parts, strict=True)), names)
+    tables.show_pairs(console, pairs, incomparable=comparison.incomparable(everything))
     if options.png:
         write_new(options.png, comparison.picture(everything))
         console.print(f" {options.png}", markup=False, highlight=False, soft_wrap=True)
