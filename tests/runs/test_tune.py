@@ -243,7 +243,9 @@ def test_another_study_is_not_mixed_in(tmp_path: Path, scored: Any) -> None:
     given = study(tmp_path)
     tune.tune(given, 1, run=scored(lambda entropy: 0.5))
     wider = replace(given, space={KEY: Dimension(0.0, 2.0)})
-    with pytest.raises(TsbenchError, match=r"holds a study of other words, seeds or ranges$"):
+    with pytest.raises(
+        TsbenchError, match=r"holds another study \(another search space\): study=PATH"
+    ):
         tune.tune(wider, 2)
     given.journal.write_bytes(b"nonsense\n" + given.journal.read_bytes())
     with pytest.raises(TsbenchError, match=r"journal\.log is damaged: "):
@@ -352,6 +354,13 @@ def test_the_command_goes_on_after_a_kill(tmp_path: Path) -> None:
         cwd=tmp_path, env=environment, capture_output=True, text=True,
     )  # fmt: skip
     assert again.stdout == f"{line}\n"
+    assert again.stderr.startswith("trial 0 of 1 is the best, worth ")
+    other = command(tmp_path, "task.budgets.smoke.act=256", "--best")
+    refused = subprocess.run(other, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert refused.returncode == 2
+    said = f"with {' '.join(small)}, without task.budgets.smoke.act=256"
+    assert said in refused.stderr
+    assert "study=PATH names another folder" in refused.stderr
     figures = json.loads((tmp_path / "best.json").read_text())
     assert figures["trials"] == 1
     config.compose(line.split()[2:])

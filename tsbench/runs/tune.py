@@ -272,8 +272,27 @@ def _opened(study: Study) -> optuna.Study:
         except (ValueError, KeyError) as error:
             raise TsbenchError(f"{study.journal} is damaged: {error}") from None
     if known not in (None, identity):
-        raise TsbenchError(f"{study.directory} holds a study of other words, seeds or ranges")
+        raise TsbenchError(
+            f"{study.directory} holds another study ({_differing(known, identity)}): "
+            "study=PATH names another folder"
+        )
     return shared
+
+
+def _differing(known: Mapping[str, Any], identity: Mapping[str, Any]) -> str:
+    """How a kept study differs from the one that is asked for."""
+    words = {name: set(said["words"]) for name, said in (("its", known), ("asked", identity))}
+    parts = [
+        f"{what} {' '.join(sorted(more))}"
+        for what, more in (
+            ("with", words["its"] - words["asked"]),
+            ("without", words["asked"] - words["its"]),
+        )
+        if more
+    ]
+    keys = [key for key in ("seeds", "space") if known[key] != identity[key]]
+    names = {"seeds": "other seeds", "space": "another search space"}
+    return ", ".join([*parts, *(names[key] for key in keys)])
 
 
 @contextmanager

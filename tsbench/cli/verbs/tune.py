@@ -41,7 +41,7 @@ def call(words: Sequence[str]) -> None:
             raise
         raise TsbenchError("optuna is missing: pip install 'tsbench[tune]'") from None
     from tsbench.core.files import write_json
-    from tsbench.core.words import command
+    from tsbench.core.words import command, several
 
     parser = Parser("tsbench tune", add_help=False, allow_abbrev=False)
     parser.add_argument("--best", action="store_true")
@@ -63,5 +63,7 @@ def call(words: Sequence[str]) -> None:
     trial, spent = tune.best(study)
     chosen = study.chosen(trial.params)
     sys.stdout.write(f"{command('run', *chosen)}\n")
+    worth = f"trial {trial.number} of {spent} is the best, worth {trial.value:.4g}"
+    sys.stderr.write(f"{worth} (mean solved_reward over {several(len(study.seeds), 'seed')})\n")
     figures = {"words": chosen, "value": trial.value, "trial": trial.number, "trials": spent}
     write_json(options.json, {**figures, "seeds": study.seeds})
