@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tsbench import cli
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_json
 from tsbench.runs import config, provenance, results
@@ -128,6 +129,35 @@ def test_results_are_read_as_they_were_kept_and_merged_by_their_words(
     merged = results.collect(results.read([again.path]), out)
     assert [(row.solved_reward, row.trials) for row in merged.rows.values()] == [(0, 12), (0.7, 12)]
     assert results.read([out]).rows == merged.rows
+
+
+def test_the_command_says_what_it_has_added_and_replaced(
+    tmp_path: Path, invented_record: Callable[[str], Record], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in range(2):
+        finish(
+            begin(tmp_path / str(seed), [*ROCKET, f"seed={seed}"]),
+            invented_record("rocket_navigation"),
+        )
+    words = ["collect", "--out", str(tmp_path / "out"), str(tmp_path / "0")]
+    assert cli.main(words) == 0
+    assert "out: 1 added, 0 replaced, 1 in all" in capsys.readouterr().out
+    assert cli.main([*words, str(tmp_path / "1")]) == 0
+    assert "out: 1 added, 1 replaced, 2 in all" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arrays", [{"loss": np.zeros(3)}, {"a b": np.zeros((3, 4))}])
+def test_curves_that_somebody_else_keeps_are_not_replaced(
+    tmp_path: Path, invented_record: Callable[[str], Record], arrays: dict[str, np.ndarray]
+) -> None:
+    run, curves = begin(tmp_path / "run", ROCKET), tmp_path / results.CURVES
+    finish(run, invented_record("rocket_navigation"))
+    np.savez(curves, **arrays)  # type: ignore[arg-type]
+    content = curves.read_bytes()
+    with pytest.raises(TsbenchError, match=r"curves\.npz holds no learning curves of tsbench"):
+        results.collect(results.read([run.path]), tmp_path)
+    assert curves.read_bytes() == content
+    assert not (tmp_path / results.ROWS).exists()
 
 
 def test_a_tuned_run_is_kept_whatever_its_settings(

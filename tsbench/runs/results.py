@@ -331,6 +331,8 @@ def _load_curves(path: Path) -> dict[tuple[str, ...], tuple[Curve, ...]]:
         with np.load(content, allow_pickle=False) as file:
             for name in file.files:
                 *words, stage = shlex.split(name)
+                if not (words and words[0].startswith("task=")):
+                    raise TsbenchError(f"{path} holds no learning curves of tsbench: {name!r}")
                 curve = Curve(stage, *file[name])
                 found[tuple(words)] = (*found.get(tuple(words), ()), curve)
     except (OSError, ValueError, TypeError, EOFError, KeyError, zipfile.BadZipFile) as error:
@@ -353,7 +355,11 @@ def collect(new: Results, place: Path, trials: int | None = None) -> Results:
     Raises:
         TsbenchError: a file in the folder is damaged, or it cannot be written.
     """
-    found = load(place) if (place / ROWS).exists() else Results()
+    if (place / ROWS).exists():
+        found = load(place)
+    else:  # the first collection, perhaps one that was killed: no file of others is replaced
+        found = Results()
+        _load_curves(place / CURVES)
     for words, row in new.rows.items():
         before = found.rows.get(words, row).trials
         new.rows[words] = replace(row, trials=before if trials is None else trials)

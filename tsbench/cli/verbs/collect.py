@@ -20,8 +20,14 @@ def call(words: Sequence[str]) -> None:
     from tsbench.runs import results
 
     found = results.read(options.runs)
+    there = (options.out / results.ROWS).exists()
+    before = results.load(options.out).rows.keys() if there else set()
     kept = results.collect(found, options.out, options.trials)
-    sys.stdout.write(f"{options.out}: {len(found.rows)} added, {len(kept.rows)} in all\n")
+    replaced = len(found.rows.keys() & before)
+    added = len(found.rows) - replaced
+    sys.stdout.write(
+        f"{options.out}: {added} added, {replaced} replaced, {len(kept.rows)} in all\n"
+    )
 
 
 def _trials(word: str) -> int:
