@@ -317,9 +317,11 @@ def test_the_board_of_the_kept_entries_is_shown_anywhere(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """It is only read: a file is written to a board that is here or that is named."""
+    (tmp_path / "leaderboards").mkdir()  # with no entry in it: not a board
     assert cli.main(["leaderboard"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("## ")
+    (tmp_path / "leaderboards").rmdir()
     for name in kept.entries():
         task, _, entry = name.partition("/")
         assert re.search(rf"^## {task}$(?:(?!^## ).)*^\| {entry} \|", text, re.M | re.S)
@@ -328,7 +330,7 @@ def test_the_board_of_the_kept_entries_is_shown_anywhere(
         assert "no board leaderboards: --board names its directory" in capsys.readouterr().err
     assert cli.main(["leaderboard", "--board", "nowhere"]) == 2
     assert "no board nowhere" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("[!.]*"))
 
 
 # Directories of runs

@@ -300,6 +300,25 @@ def test_a_method_that_returns_no_policy(toy: Toy, tmp_path: Path) -> None:
     assert done.stderr.splitlines()[-1].startswith(line)
 
 
+def test_a_policy_that_names_another_method(toy: Toy, tmp_path: Path) -> None:
+    (toy.folder / "lazy.py").write_text(METHOD.replace('method="lazy"', 'method="twostage"'))
+    done = call(tmp_path, *QUICK)
+    assert done.returncode == 2
+    line = "tsbench: the method lazy returns a policy that names the method twostage"
+    assert done.stderr.splitlines()[-1].startswith(line)
+
+
+def test_a_method_that_goes_beyond_its_budget(toy: Toy, tmp_path: Path) -> None:
+    more = "replace(problem, budget=replace(problem.budget, act=20 * problem.budget.act))"
+    (toy.folder / "lazy.py").write_text(
+        METHOD.replace("= twostage.train(problem,", f"= twostage.train({more},")
+    )
+    done = call(tmp_path, *QUICK)
+    assert done.returncode == 0, done.stderr
+    line = "over the budget, so no leaderboard takes this run: stages of 10,752 steps, where the"
+    assert line in done.stdout
+
+
 def test_a_missing_module_and_a_single_one(toy: Toy, tmp_path: Path) -> None:
     (toy.folder / "task.py").unlink()
     (toy.folder / "lazy.py").unlink()

@@ -166,7 +166,8 @@ def test_an_entry_is_verified_in_full_and_the_verdict_kept(
 def test_a_check_keeps_nothing(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert submit("one", "--check") == 0
     assert "re-scored: seed3 was compared bit for bit" in capsys.readouterr().out
-    assert not list(Path("board").iterdir())
+    assert not Path("board").exists()
+    assert not list(Path().glob(".submit-*"))
 
 
 def test_an_entry_keeps_the_learning_curves(
@@ -240,6 +241,8 @@ def test_a_score_by_another_protocol_is_made_again(
     content["score"]["nominal"]["normalized_reward"] = 0.99
     (finished / "score.json").write_bytes(encode_json(content))
     assert submit("one") == 0
+    said = "one: its score is by the protocol smoke, so it is scored again by quick"
+    assert said in capsys.readouterr().err
     score = submission.read_entry(ENTRY).kept[0].record.score
     assert score.protocol == "quick"
     assert score.nominal.normalized_reward != 0.99
@@ -257,6 +260,20 @@ def bare(name: str) -> Callable[[Path], object]:
             (run / one).unlink()
 
     return spoil
+
+
+def other_stage(run: Path, **changes: int) -> None:
+    """Changes the stage in physics."""
+    stages = json.loads((run / "score.json").read_text())["stages"]
+    other_score(run, "stages", value=[stages[0], stages[1] | changes])
+
+
+def spend(run: Path, steps: int) -> None:
+    """Lets the run have taken so many steps in all, most of them in physics."""
+    stages = json.loads((run / "score.json").read_text())["stages"]
+    acted = steps - stages[0]["steps"]
+    substeps = stages[1]["physics_substeps"] // stages[1]["steps"] * acted
+    other_stage(run, steps=acted, physics_substeps=substeps)
 
 
 def plan_of_another_task(run: Path) -> None:
@@ -286,6 +303,8 @@ def plan_of_another_task(run: Path) -> None:
             "mixes several runs: its files disagree on the policy",
         ),
         (lambda run: other_score(run, "standard", value=False), "changed constants"),
+        (lambda run: spend(run, 4 * 5000), "20,000 steps used, where the budget smoke has"),
+        (lambda run: other_stage(run, budget=10**7), "stages of 10,000,512 steps, where the"),
         (lambda run: (run / "versions.json").write_text("hi"), "damaged versions"),
         (
             lambda run: other_score(run, "score", "origin", "protocol", "seed", value=1),
@@ -318,7 +337,8 @@ def test_what_does_not_belong_together_is_no_entry(
     assert line in error
     assert error.count("\n") == 1
     assert ".submit-" not in error
-    assert not list(Path("board").iterdir())
+    assert not Path("board").exists()
+    assert not list(Path().glob(".submit-*"))
 
 
 def test_files_that_are_swapped_while_they_are_scored(finished: Path) -> None:
@@ -466,10 +486,31 @@ def test_directories_that_are_no_entry_or_no_run(
         assert f"{place} is no entry, it has no manifest.json: {MADE}" in capsys.readouterr().out
     assert submit(str(ENTRY), "--check") == 2
     assert f"name the trainings in it, {ENTRY / 'seed*'}" in capsys.readouterr().err
+    assert cli.main(["verify", "nothing"]) == 2
+    assert capsys.readouterr().err == "tsbench: no entry nothing\n"
+    assert cli.main(["verify", str(ENTRY), "--retract", " ", "--board", "board"]) == 2
+    assert "needs a reason" in capsys.readouterr().err
+    assert not Path("board/verdicts").exists()
     assert submit("one/score.json", "--check") == 2
     assert "no run directory one/score.json" in capsys.readouterr().err
     assert submit("one", "--check") == 2
     assert "mine exists and nothing is overwritten: give another --name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [TOLD[:2], TOLD[2:4], TOLD[4:6], TOLD[6:], TOLD])
+def test_what_a_run_says_itself_is_not_told_again(
+    finished: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    assert submit("one", *words) == 2
+    assert "one is a run of tsbench, which says its own seed" in capsys.readouterr().err
+    assert not Path("board").exists()
+
+
+def test_a_board_that_cannot_be_made(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("board").write_text("a file")
+    assert submit("one") == 2
+    assert "board is no folder, so no board can be made there" in capsys.readouterr().err
+    assert Path("board").read_text() == "a file"
 
 
 def test_a_claim_that_the_policy_does_not_earn(

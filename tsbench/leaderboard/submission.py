@@ -497,13 +497,8 @@ def _check_agreement(
             ("budget", [manifest.budget, config.budget]),
             ("command", [training.command, run.command]),
         ]
-        allowed = config.task.budgets[config.budget]
-        used = sum(stage.budget for stage in record.stages)
-        if used > allowed.plan + allowed.act:
-            raise TsbenchError(
-                f"{run.score_file}: stages of {used:,} steps, where the budget "
-                f"{config.budget} has {allowed.plan + allowed.act:,}"
-            )
+        if more := directory.overspent(record.stages, config):
+            raise TsbenchError(f"{run.score_file}: {more}")
     for what, values in said:
         if any(value != values[0] for value in values):
             told = dict.fromkeys(quoted(one) for one in values if isinstance(one, (str, int)))
@@ -581,6 +576,7 @@ def pack(
     told: Told | None = None,
     score: Scorer,
     rescore: bool = False,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> Path:
     """Packs runs into an entry outside of the board, and checks the packed files (`read_entry`).
 
@@ -593,6 +589,7 @@ def pack(
         told: of trainings that tsbench did not make.
         score: makes the score of a policy that has none by the protocol.
         rescore: whether every score is made again.
+        tell: is given a line for each score by another protocol, which is made again.
 
     Returns:
         The directory of the entry, which `place` moves to the board, `discard` removes.
@@ -601,8 +598,11 @@ def pack(
         TsbenchError: a run cannot be a part of an entry, or the runs cannot make one.
     """
     with os_errors(board):
-        board.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=".submit-", dir=board))
+        # A board that there is not yet is made with its first entry.
+        there = next(one for one in (board, *board.absolute().parents) if os.path.lexists(one))
+        if not there.is_dir():
+            raise TsbenchError(f"{there} is no folder, so no board can be made there")
+        folder = Path(tempfile.mkdtemp(prefix=".submit-", dir=there))
     copies: dict[Path, Path] = {}
     try:
         with os_errors(folder):
@@ -610,7 +610,7 @@ def pack(
             for i, run in enumerate(runs):
                 copies[folder / str(i)] = run
                 part = _pack_run(
-                    RunDirectory(run), folder / str(i), protocol, told, i, score, rescore
+                    RunDirectory(run), folder / str(i), protocol, told, i, score, rescore, tell
                 )
                 parts.append(part)
                 record = part[1]
@@ -688,6 +688,7 @@ def _pack_run(
     number: int,
     score: Scorer,
     rescore: bool,
+    tell: Callable[[str], None],
 ) -> tuple[Path, Record]:
     """Copies a run's files, reading each of them once, and makes its score if it has none."""
     if not run.policy_info_file.exists():
@@ -714,6 +715,9 @@ def _pack_run(
                 f"{run.path} has no {run.actions_file.name}: --rescore makes it, with the score"
             )
         return folder, before
+    if before is not None and before.score.protocol != protocol.name:
+        by = f"its score is by the protocol {before.score.protocol}"
+        tell(f"{run.path}: {by}, so it is scored again by {protocol.name}")
     trained = copy.policy()
     task = copy.task(trained.info.task)
     made = score(trained, task)

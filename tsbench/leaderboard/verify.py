@@ -349,8 +349,10 @@ def retracted(path: Path, reason: str) -> Verdict:
     """The verdict on an entry that is taken back.
 
     Raises:
-        TsbenchError: there is no such entry.
+        TsbenchError: there is no such entry, or the reason says nothing.
     """
+    if not reason.strip():
+        raise TsbenchError("a verdict that takes an entry back needs a reason")
     entry = read_entry(path)
     reasons = (plain_line(f"retracted: {reason}"),)
     return Verdict(entry.name, entry.manifest.digest, RETRACTED, False, reasons, (), 0.0)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,6 +27,7 @@ from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
+from tsbench.rl.settings import PPOSettings
 from tsbench.runs.schema import RunConfig
 
 M = TypeVar("M", Plan, ReferenceMotion)
@@ -74,6 +76,38 @@ class Stage:
     warnings: dict[str, int] = field(default_factory=dict)
     seconds: float = 0.0
     interruptions: int = 0
+
+
+def overspent(stages: Sequence[Stage], config: RunConfig) -> str:
+    """By how much the stages go beyond the run's budget, in words, or "" if they do not.
+
+    A stage may finish the iteration in which its budget ends: the actions of all its environments
+    between two updates. The largest iteration of the configuration is allowed to each stage, since
+    a method's stages need not bear the names of their settings.
+    """
+    allowed = config.task.budgets[config.budget]
+    most, name = allowed.plan + allowed.act, f"the budget {config.budget}"
+    planned = sum(stage.budget for stage in stages)
+    if planned > most:
+        return f"stages of {planned:,} steps, where {name} has {most:,}"
+    used = sum(stage.steps for stage in stages)
+    together = allowed.environments
+    iteration = max(_iteration(each, together) for each in ({}, *config.task.training.values()))
+    if used > most + len(stages) * iteration:
+        rest = f"and lets a stage finish an iteration of {iteration:,}"
+        return f"{used:,} steps used, where {name} has {most:,} {rest}"
+    return ""
+
+
+def _iteration(training: Mapping[str, Any], environments: int | None) -> int:
+    """Environment steps between two updates by these changes to the settings of a stage, with so
+    many environments at most."""
+    most = {"environments": environments}
+    return math.prod(
+        min(size, most.get(name) or size) if isinstance(size, int) else 1
+        for name in ("environments", "rollout", "repeat")
+        if (size := training.get(name, getattr(PPOSettings, name)))
+    )
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from tsbench.rl.devices import torch_device
 from tsbench.rl.stages import settings
 from tsbench.rl.threads import one_thread
 from tsbench.runs import events
-from tsbench.runs.directory import CHECKPOINTS, Record, RunDirectory
+from tsbench.runs.directory import CHECKPOINTS, Record, RunDirectory, overspent
 from tsbench.runs.progress import Output, progress_bar
 from tsbench.runs.provenance import check_provenance, identity, write_provenance
 from tsbench.runs.schema import RunConfig
@@ -274,7 +274,12 @@ def _train(
     if not isinstance(policy, Policy):
         given = type(policy).__name__
         raise TsbenchError(f"the method {name} returns {given}, not a Policy")
+    if policy.info.method != name:
+        other = policy.info.method
+        raise TsbenchError(f"the method {name} returns a policy that names the method {other}")
     check_fit(policy, problem.task)
+    if more := overspent(workspace.stages, config):
+        workspace.note(f"over the budget, so no leaderboard takes this run: {more}")
     policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
     workspace.note(f"evaluation by protocol {protocol.name}")

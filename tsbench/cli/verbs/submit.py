@@ -56,6 +56,9 @@ def call(words: Sequence[str]) -> int:
     except ValueError as error:
         raise TsbenchError(str(error)) from None
     foreign = (options.seeds, options.steps, options.seconds, options.command)
+    own = [run for run in options.runs if (run / "config.yaml").exists()]
+    if own and any(one is not None for one in (*foreign, options.code)):
+        parser.error(f"{own[0]} is a run of tsbench, which says its own seed, steps and command")
     if None not in foreign and len(options.seeds) != len(options.runs):
         parser.error(f"{len(options.seeds)} --seeds for {len(options.runs)} runs")
     given = (
@@ -70,7 +73,7 @@ def call(words: Sequence[str]) -> int:
 
     packed = submission.pack(
         options.runs, described, options.board, V1, told=given, score=score,
-        rescore=options.rescore,
+        rescore=options.rescore, tell=tell(console),
     )  # fmt: skip
     try:
         submission.home(packed, options.board, V1, options.runs)

@@ -40,6 +40,9 @@ def call(words: Sequence[str]) -> int:
     console = Console()
     written = options.record or options.retract is not None
     board = places.board(options.board, BOARD, written=written)
+    for entry in options.entries:
+        if not (entry.is_dir() or entry.is_symlink()):
+            raise TsbenchError(f"no entry {entry}")
     faults: list[str] = []
     if options.pull_request is not None:
         entries, faults = pull_request.entries(options.checkout, options.pull_request)
