@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import mujoco
@@ -44,6 +44,11 @@ def short_start(self: Rocket, *arguments: Any, **options: Any) -> Any:
 def flat_memory(self: Rocket, *arguments: Any, **options: Any) -> Any:
     start = Rocket.start(self, *arguments, **options)
     return replace(start, memory=start.time)
+
+
+def short_ideal(self: Rocket) -> Any:
+    states = Rocket.ideal(self)
+    return replace(states, **{part.name: getattr(states, part.name)[1:] for part in fields(states)})
 
 
 def planner(**parts: Any) -> Callable[[Rocket], Any]:
@@ -99,6 +104,16 @@ def planner(**parts: Any) -> Callable[[Rocket], Any]:
         ),
         ({"success": lambda self, state, course: True}, r"success is of type bool, not an array"),
         ({"success": lambda self, state, course: 1 / 0}, r"success fails with ZeroDivisionError: "),
+        (
+            {"reward": lambda self, previous, action, state: 1.5 + 0.0 * state.time},
+            r"reward is 1\.5, above its max_reward of 0\.9$",
+        ),
+        ({"push_steps": ()}, r"push_steps are \(\), not one or more rising steps from 0 to \d+$"),
+        ({"push_steps": (0, 10**6)}, r"push_steps are \(0, 1000000\), not"),
+        ({"push_steps": (9, 3)}, r"push_steps are \(9, 3\), not"),
+        ({"push_steps": 3}, r"push_steps fails with TypeError"),
+        ({"ideal": short_ideal}, r"ideal has times of the shape \((\d+),\); states needed: \d+, "),
+        ({"ideal": lambda self: None}, r"ideal fails with AttributeError"),
         (
             {"abstraction": planner(observation_size=1)},
             r"observation of the planning variant \(observation_size 1\)",

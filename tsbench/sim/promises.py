@@ -24,6 +24,7 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.physics import Physics
 
 ROWS = 3  # states to try: another number than one, which numpy would stretch
+TOLERANCE = 1e-9  # of a reward above the largest one, for rounding
 
 
 def check_promises(name: str, task: Task[Any]) -> None:
@@ -89,6 +90,22 @@ class _Trial:
             self.verdict("success", task.success(following, course))
         with self.explained("goal_distance"):
             self.expect("goal_distance", task.goal_distance(following), ROWS)
+        self.protocol()
+
+    def protocol(self) -> None:
+        """What the protocol asks of a task: the instants of pushes, and the best motion known."""
+        task = self.task
+        with self.explained("push_steps"):
+            steps = tuple(task.push_steps)
+            within = all(0 <= step < task.horizon for step in steps)
+        if not (steps and within and list(steps) == sorted(set(steps))):
+            needed = f"one or more rising steps from 0 to {task.horizon - 1}"
+            raise self.broken(f"push_steps are {steps}, not {needed}")
+        with self.explained("ideal"):
+            frames = np.shape(task.ideal().time)
+        if frames != (task.horizon + 1,):
+            needed = f"{task.horizon + 1}, one before and one after each step of the horizon"
+            raise self.broken(f"ideal has times of the shape {frames}; states needed: {needed}")
 
     def controls(
         self, state: State, action: np.ndarray, model: mujoco.MjModel, remembered: int
@@ -133,6 +150,9 @@ class _Trial:
         with self.explained(f"reward{where}"):
             reward = mdp.reward(state, action, following)
         self.expect(f"reward{where}", reward, ROWS)
+        if (found := float(np.max(reward))) > mdp.max_reward * (1.0 + TOLERANCE):
+            limit = f"its max_reward of {mdp.max_reward:g}"
+            raise self.broken(f"reward{where} is {found:g}, above {limit}")
         for part in ("terminal", "reached", "violated"):
             with self.explained(part):
                 self.verdict(part, getattr(mdp, part)(following))
