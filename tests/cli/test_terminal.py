@@ -351,6 +351,26 @@ def test_short_names_of_run_directories() -> None:
     assert name("task.training.plan.clip=0.3") != name("task.training.imitate.clip=0.3")
 
 
+@pytest.mark.parametrize("verb", ["evaluate", "view", "report", "export", "submit"])
+@pytest.mark.parametrize("failed", [False, True])
+def test_a_run_without_a_policy_says_how_to_go_on(
+    verb: str, failed: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunDirectory(Path("one"))
+    run.path.mkdir()
+    run.config_file.write_text("# tsbench run task=rocket_navigation\n")
+    if failed:
+        run.failure_file.write_text("the plan fails its audit\n")
+    more = {
+        "export": ["out"],
+        "submit": ["--name", "mine", "--author", "A", "--licence", "MIT"],
+    }
+    assert cli.main([verb, "one", *more.get(verb, [])]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    said = "not finished: tsbench run resume=one"
+    assert ("the run in one has failed: the plan fails" if failed else said) in line
+
+
 # The doctor
 
 

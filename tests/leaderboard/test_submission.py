@@ -319,7 +319,7 @@ def plan_of_another_task(run: Path) -> None:
             "contradicts itself: survival_100N is not that of the surface",
         ),
         (lambda run: (run / "actions.npz").unlink(), "one has no actions.npz: --rescore makes it"),
-        (lambda run: (run / "policy.json").unlink(), "tsbench run resume=one"),
+        (lambda run: (run / "policy.json").unlink(), "one holds no policy (no policy.json)"),
         (lambda run: (run / "score.json").unlink(), "is not finished: tsbench run resume=one"),
         (bare("policy.json"), "an action log alone is no entry"),
         (bare("score.json"), "of a policy that tsbench did not train say --seeds, --steps"),

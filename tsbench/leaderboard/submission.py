@@ -35,7 +35,6 @@ from tsbench.core.files import check_new, parse_json, read_file, write_json, wri
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
-from tsbench.core.words import command
 from tsbench.evaluation.evaluate import check_fit
 from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.replay import contradictions
@@ -703,8 +702,8 @@ def _pack_run(
     copy = RunDirectory(folder)
     before = copy.record() if copy.finished else None
     if before is None and told is None:
-        if copy.begun:
-            raise TsbenchError(_unfinished(run))
+        if run.unfinished:
+            raise TsbenchError(run.unfinished)
         raise TsbenchError(
             f"{run.path} has no {run.score_file.name}: of a policy that tsbench did not train "
             "say --seeds, --steps, --seconds and --command"
@@ -738,20 +737,13 @@ def _without_policy(run: RunDirectory) -> str:
     place, lacking = run.path, f"{run.path} holds no policy (no {run.policy_info_file.name})"
     if not place.is_dir():
         return f"no run directory {place}"
-    if run.begun:
-        return _unfinished(run)
+    if run.unfinished:
+        return run.unfinished
     if any(place.glob("seed*/policy.json")):
         return f"{lacking}: name the trainings in it, {place / 'seed*'}"
     if run.actions_file.exists():
         return f"{lacking}; an action log alone is no entry: it cannot be scored from other starts"
     return lacking
-
-
-def _unfinished(run: RunDirectory) -> str:
-    if run.failure:
-        return f"{run.path} has failed and cannot be submitted: {run.failure}"
-    way_on = command("run", f"resume={run.path}")
-    return f"{run.path} has no {run.score_file.name}, its run is not finished: {way_on}"
 
 
 def _record(told: Told, number: int, trained: Policy, task: Task[Any], made: Score) -> Record:

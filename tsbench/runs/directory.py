@@ -26,6 +26,7 @@ from tsbench.core.motion import ActionLog, Plan, ReferenceMotion, Roadmap
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
+from tsbench.core.words import command
 from tsbench.evaluation.score import Score
 from tsbench.rl.settings import PPOSettings
 from tsbench.runs.schema import RunConfig
@@ -227,6 +228,16 @@ class RunDirectory:
             return ""
         return read_file(self.failure_file, MAX_FAILURE, "failure").decode(errors="replace").strip()
 
+    @property
+    def unfinished(self) -> str:
+        """Why the run has no score, and how to go on, in words; "" if it has one, or if there is no
+        run."""
+        if self.finished or not self.begun:
+            return ""
+        if self.failure:
+            return f"the run in {self.path} has failed: {self.failure}"
+        return f"the run in {self.path} is not finished: {command('run', f'resume={self.path}')}"
+
     def config(self) -> RunConfig:
         """The configuration of the run."""
         try:
@@ -274,6 +285,8 @@ class RunDirectory:
         """The policy. A directory with only the policy's two files suffices."""
         if not self.path.is_dir():
             raise TsbenchError(f"no run directory {self.path}")
+        if self.unfinished and not self.policy_info_file.exists():
+            raise TsbenchError(self.unfinished)
         return Policy.load(self.path)
 
     def task(self, name: str) -> Task[Any]:

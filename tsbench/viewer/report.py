@@ -69,7 +69,7 @@ def check_finished(run: RunDirectory) -> None:
         raise TsbenchError(f"no run directory {run.path}")
     if not run.finished:
         reason = "only a finished run has a report"
-        raise TsbenchError(f"{run.path} has no {run.score_file.name}: {reason}")
+        raise TsbenchError(run.unfinished or f"{run.path} has no {run.score_file.name}: {reason}")
 
 
 def _pages(run: RunDirectory) -> tuple[str, str]:

@@ -70,7 +70,10 @@ def call(words: Sequence[str]) -> int:
         score = evaluate(
             policy, task, protocol=protocol, threads=options.threads, progress=progress
         )
-    tables.show_score(console, f"{task.name}: {options.policy}", score, task)
+    label = options.policy
+    if path.is_dir() and path.name != places.path(label).name:
+        label = f"{label}, {path.name}"  # of an entry's trainings
+    tables.show_score(console, f"{task.name}: {label}", score, task)
     tables.show_rank(console, standard, score)
     shown: dict[str, Any] = {**score.as_dict(), "standard": standard}
     confirmed = True
