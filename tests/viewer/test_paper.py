@@ -109,6 +109,26 @@ def test_a_variant_has_one_colour_in_all_tasks(make: Callable[..., Result]) -> N
     assert colours[PRM] == {COLOURS[PRM]}
 
 
+def test_what_was_tuned_is_held_against_the_tuned_method(make: Callable[..., Result]) -> None:
+    """Its label does not list the settings, of which there are many."""
+    few, many = "method.explore=0.5", "task.training.imitate.epochs=8"
+    rows = [
+        make(OURS, 0, 0.1), make(OURS, 1, 0.1), make(MONOLITHIC, 0, 0.4),
+        replace(make(OURS, 0, 0.3, 1.0, few, many), trials=12),
+        replace(make(MONOLITHIC, 0, 0.9, 1.0, many), trials=12),
+        make(PRM, 0, 0.2, 1.0, "method.shortcut=true"),
+    ]  # fmt: skip
+    lines = scores.table(grouped(of(rows).groups()), {ROCKET: tasks.make(ROCKET)})
+    differences = {line.group.label: line.against and line.against.mean for line in lines}
+    assert differences == {
+        OURS: None,
+        f"{OURS}, tuned": pytest.approx(0.2),
+        MONOLITHIC: pytest.approx(0.3),
+        f"{MONOLITHIC}, tuned": pytest.approx(0.6),
+        f"{PRM}, shortcut=true": pytest.approx(0.1),
+    }
+
+
 def test_variants_of_a_method_are_told_apart(make: Callable[..., Result]) -> None:
     few, many = "task.training.imitate.epochs=2", "task.training.imitate.epochs=8"
     (group,) = grouped(of([make(OURS, 0, 0.1, 1.0, few)]).groups())

@@ -167,13 +167,11 @@ def _main_budget(groups: Sequence[Sequence[Result]], one: Result) -> str:
 
 
 def _label(result: Result, *, whole: bool = False) -> str:
-    """The method with its options. Of settings of its own it says that there are some, or `whole`
-    which."""
-    options = [
-        word.removeprefix("method.") for word in result.options if not word.startswith("task.")
-    ]
-    others = [word for word in result.options if word.startswith("task.")]
-    if others:
+    """The method with its options. Of the task's settings for it, and of all that were tuned, it
+    says that there are some, or `whole` which."""
+    shown = [word for word in result.options if not (result.trials or word.startswith("task."))]
+    options = [word.removeprefix("method.") for word in shown]
+    if others := [word for word in result.options if word not in shown]:
         said = "tuned" if result.trials else "other settings"
         options.append(f"{said} ({', '.join(others)})" if whole else said)
     return ", ".join([result.method, *options])

@@ -39,7 +39,8 @@ class Line:
         success: mean share of the perturbed starts solved.
         succeeding: seeds that solve at least `ENOUGH` of them.
         measures: means of the task's leading measures, over the seeds that have them.
-        against: `solved_reward` less that of the two-stage method with the same seeds.
+        against: `solved_reward` less that of the two-stage method with the same seeds, tuned as
+            much if there is such a group.
         p_value: of that, after Holm over the rows of the table that have an interval; None for
             the others.
     """
@@ -59,15 +60,24 @@ def table(groups: Sequence[Group], tasks: dict[str, Task]) -> list[Line]:
     ordered = [group for members in by_task(groups).values() for group in members]
     against: dict[Group, Difference] = {}
     for group in ordered:
-        ours = main_group(groups, group.task, OURS)
-        if ours is not None and group is not ours:
-            found = difference(group, ours, "solved_reward")
-            if found is not None:
-                against[group] = found
+        ours = _ours(groups, group)
+        found = difference(group, ours, "solved_reward") if ours else None
+        if found is not None:
+            against[group] = found
     sure = [group for group, one in against.items() if one.interval is not None]
     corrected = holm({str(i): against[group].p_value for i, group in enumerate(sure)})
     p_values = dict(zip(sure, corrected.values(), strict=True))
     return [_line(group, tasks, against.get(group), p_values.get(group)) for group in ordered]
+
+
+def _ours(groups: Sequence[Group], group: Group) -> Group | None:
+    """The two-stage method's group that another one is held against: one that was tuned as much,
+    else the main one, which is held against none."""
+    main = main_group(groups, group.task, OURS)
+    if main is group:
+        return None
+    alike = [one for one in groups if one.first.trials == group.first.trials and one is not group]
+    return main_group(alike, group.task, OURS) or main
 
 
 def _line(
