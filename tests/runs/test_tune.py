@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from optuna.samplers import TPESampler
 
 from tsbench import TsbenchError, cli, methods
 from tsbench.core import plugins
@@ -62,18 +63,50 @@ def trials(given: Study) -> list[Any]:
 
 
 def test_it_finds_the_better_settings(tmp_path: Path, scored: Any) -> None:
-    """Beyond the random trials it tries settings near the best ones, of which it finds one."""
+    """Beyond the random trials it tries settings near the best ones, of which it finds one. The
+    first trial has the method's own settings, which are far away."""
     given = study(tmp_path)
     tune.tune(given, 24, run=scored(lambda entropy: 1.0 - abs(entropy - 0.3)))
     trial, spent = tune.best(given)
     assert spent == 24
     assert abs(trial.params[KEY] - 0.3) < 0.05
-    far = [abs(one.params[KEY] - 0.3) for one in trials(given)]
-    assert sum(far[-10:]) / 10 < sum(far[:4]) / 8
+    first, *others = trials(given)
+    assert first.params == {}
+    own = config.compose(list(WORDS)).task.training["task"]["entropy"]
+    assert first.value == pytest.approx(1.0 - abs(own - 0.3) + 0.5e-3)
+    far = [abs(one.params[KEY] - 0.3) for one in others]
+    assert sum(far[-10:]) / 10 < sum(far[:3]) / 6
     assert abs(trial.params[KEY] - 0.3) == min(far)
     assert trial.value == pytest.approx(1.0 - abs(trial.params[KEY] - 0.3) + 0.5e-3)
     made = config.compose(given.chosen(trial.params))
     assert made.task.training["task"]["entropy"] == trial.params[KEY]
+
+
+def test_settings_that_are_no_better_are_not_taken(tmp_path: Path, scored: Any) -> None:
+    given = study(tmp_path)
+    tune.tune(given, 6, run=scored(lambda entropy: 0.5))
+    trial, spent = tune.best(given)
+    assert (trial.number, spent) == (0, 6)
+    assert given.chosen(trial.params) == list(WORDS)
+
+
+def test_settings_are_drawn_together_after_the_first_trials(
+    tmp_path: Path, scored: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one, which has chosen none, would leave TPE without settings in common."""
+    space = {KEY: Dimension(0.0, 1.0), "task.training.task.clip": Dimension(0.1, 0.9)}
+    together, draw = [], TPESampler.sample_relative
+
+    def noted(self: Any, shared: Any, trial: Any, search_space: Any) -> Any:
+        found = draw(self, shared, trial, search_space)
+        together.append(set(found))
+        return found
+
+    monkeypatch.setattr(TPESampler, "sample_relative", noted)
+    given = study(tmp_path, **space)
+    tune.tune(given, 6, run=scored(lambda entropy: entropy))
+    random = tune.FIRST_TRIALS - 1  # after the method's own settings
+    assert together == [set()] * random + [set(space)] * 2
 
 
 def test_all_trials_train_with_the_same_seeds(tmp_path: Path, scored: Any) -> None:
@@ -209,7 +242,7 @@ def test_processes_share_a_study(tmp_path: Path) -> None:
     assert [worker.exitcode for worker in workers] == [0, 0]
     done = trials(given)
     assert [trial.state.name for trial in done] == ["COMPLETE"] * 4
-    assert len({trial.params[KEY] for trial in done}) == 4
+    assert len({trial.params.get(KEY) for trial in done}) == 4
     by = [[path.read_text().split() for path in given.place(n).glob("*/by")] for n in range(4)]
     assert all(len(runs) == 3 and all(len(once) == 1 for once in runs) for runs in by)
     workers_of = [{once[0] for once in runs} for runs in by]

@@ -2,8 +2,9 @@
 
 A study is a directory: the journal of its trials, which all processes that work on it share, and
 the runs of every trial. A trial is one choice of settings, run with the same training seeds as all
-others. Every lock is the kernel's, so a killed process leaves none behind: whoever comes next takes
-over its trial and resumes its runs.
+others. The first one has the method's own settings, so that tuning does not end with worse ones by
+the luck of a few seeds. Every lock is the kernel's, so a killed process leaves none behind: whoever
+comes next takes over its trial and resumes its runs.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -20,6 +22,7 @@ from typing import Any
 
 import optuna
 import yaml
+from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import MedianPruner
 from optuna.samplers import TPESampler
 from optuna.storages import JournalStorage
@@ -39,8 +42,9 @@ FIRST_SEED = 1_000_000
 SEEDS = 3
 # Of normalized_reward beside solved_reward: it orders trials that solve equally much, as nothing.
 TIE_BREAKER = 1e-3
-# Trials that are drawn at random before TPE learns from them, and that no pruning compares yet.
-RANDOM_TRIALS = 4
+# Trials before TPE learns from them, and that no pruning compares yet: the method's own settings,
+# and then random ones.
+FIRST_TRIALS = 4
 
 DIRECTORY = Path("studies")
 Execute = Callable[[RunConfig, Sequence[str]], object]  # leaves a finished run in the directory
@@ -263,7 +267,7 @@ def _opened(study: Study) -> optuna.Study:
                 storage=JournalStorage(backend),
                 study_name="tune",
                 direction="maximize",
-                pruner=MedianPruner(n_startup_trials=RANDOM_TRIALS),
+                pruner=MedianPruner(n_startup_trials=FIRST_TRIALS),
                 load_if_exists=True,
             )
             known = shared.user_attrs.get("identity")
@@ -309,13 +313,11 @@ def _claimed(study: Study, shared: optuna.Study, trials: int) -> Iterator[Trial 
                     trial = Trial(shared, one._trial_id)
                     break
         if trial is None and len(known) < trials:
-            # Seeded by the trial: two processes must not draw the same settings.
-            shared.sampler = TPESampler(
-                multivariate=True, n_startup_trials=RANDOM_TRIALS, seed=FIRST_SEED + len(known)
-            )
+            shared.sampler = _sampler(len(known))
             trial = shared.ask()
             held = _lock(study.place(trial.number) / "lock", wait=True)
-        if trial is not None:  # an unfinished one may have been stopped before it had chosen all
+        if trial is not None and trial.number > 0:
+            # An unfinished one may have been stopped before it had chosen all.
             for key, dimension in study.space.items():
                 dimension.draw(trial, key)
     try:
@@ -323,6 +325,16 @@ def _claimed(study: Study, shared: optuna.Study, trials: int) -> Iterator[Trial 
     finally:
         if held is not None:
             os.close(held)
+
+
+def _sampler(trial: int) -> TPESampler:
+    """Seeded by the trial: two processes must not draw the same settings. Grouped, so that it draws
+    them together although the first trial has chosen none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return TPESampler(
+            multivariate=True, group=True, n_startup_trials=FIRST_TRIALS, seed=FIRST_SEED + trial
+        )
 
 
 def _word(value: Any) -> str:
