@@ -122,7 +122,7 @@ def task_card(table: Table) -> str:
     if isinstance(task, Plannable):
         parts += ["## Planning and imitation", *_variants(task)]
     parts += ["## Budgets", _budgets(task.name), "## Constants", *_constants(task)]
-    parts += ["## Try it", _try(task.name)]
+    parts += ["## Try it", _try(task)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -339,13 +339,12 @@ def _value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _try(name: str) -> str:
-    return f"""\
-```sh
-tsbench run task={name}
-tsbench view task={name}
-tsbench evaluate zero task={name}
-```"""
+def _try(task: Task[Any]) -> str:
+    name = task.name
+    lines = [f"tsbench run task={name}", f"tsbench view task={name}"]
+    if not isinstance(task, Plannable):  # there is no plan to follow or to view
+        lines = [f"tsbench run task={name} method={methods.PLANLESS}"]
+    return "\n".join(["```sh", *lines, f"tsbench evaluate zero task={name}", "```"])
 
 
 def _yaml(group: str, name: str) -> str:

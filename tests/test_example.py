@@ -72,6 +72,24 @@ def test_a_planner_that_imitates_has_the_options_of_imitation() -> None:
     assert {field.name for field in fields(ImitationOptions)} <= settings.keys()
 
 
+def test_an_ideal_without_a_plan_is_the_plan_s() -> None:
+    (by_hand,) = pieces("")
+    script = f"""
+from dataclasses import asdict
+import numpy as np
+from planar_puck.task import PuckGap, PuckState
+class ByHand(PuckGap):
+{by_hand}
+one, other = (asdict(task().ideal()) for task in (PuckGap, ByHand))
+for name, values in one.items():
+    np.testing.assert_allclose(other[name], values, atol=1e-9)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=EXAMPLE, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_guide_shows_no_other_file() -> None:
     shown = {file for language, file, _ in BLOCK.findall(GUIDE) if file and language != "sh"}
     assert shown == set(files())

@@ -5,6 +5,7 @@ The cart is a minimal task: a mass on a rail that has to stop at a mark.
 
 from __future__ import annotations
 
+import io
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,8 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from rich.console import Console
 
-from tsbench import TsbenchError, methods
+from tsbench import TsbenchError, methods, tasks
+from tsbench.cli import describe
+from tsbench.core import plugins
 from tsbench.core.arrays import Array, array_namespace
 from tsbench.core.method import Budget, Problem
 from tsbench.core.motion import Audit, AuditItem, Plan, ReferenceMotion
@@ -24,6 +28,7 @@ from tsbench.core.task import Abstraction, Plannable, Task, Tracker
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import SMOKE
 from tsbench.methods.twostage import extract
+from tsbench.runs import schema
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.kinematic import Planning, naive_plan
 from tsbench.sim.physics import Physics
@@ -198,12 +203,29 @@ def test_a_task_without_a_planning_variant_can_be_learned_scored_and_seen(tmp_pa
 def test_what_needs_a_planning_variant_says_so(tmp_path: Path) -> None:
     words = "^cart has no planning variant, which this needs$"
     given, desk = problem(Cart(), tmp_path)
-    with pytest.raises(TsbenchError, match=words):
-        methods.find("twostage").train(given, desk)
+    for method in ("twostage", "prm", "prm_rl"):
+        lacks = (
+            f"^the method {method} needs a planning variant, which cart lacks; method=monolithic"
+        )
+        with pytest.raises(TsbenchError, match=lacks):
+            methods.find(method).train(given, desk)
     with pytest.raises(TsbenchError, match=words):
         Planning(Cart())
     with pytest.raises(TsbenchError, match=words):
         Imitation(Cart(), PlannableCart().reference(naive_plan(PlannableCart())))
+
+
+def test_the_card_of_a_task_without_a_plan_suggests_a_method_that_can_learn_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tasks, "_factories", {})
+    monkeypatch.setattr(tasks, "provider", lambda name: plugins.own())
+    tasks.register("cart")(Cart)
+    monkeypatch.setattr(schema, "budgets", lambda name: {})  # it has no configuration
+    console = Console(file=io.StringIO(), record=True)
+    describe.show(console, "cart")
+    words = "Try it: tsbench run task=cart method=monolithic budget=smoke"
+    assert console.export_text().splitlines()[-1] == words
 
 
 def test_a_task_with_other_tracking_data(tmp_path: Path) -> None:

@@ -58,6 +58,19 @@ def test_impossible_constants(name: str, distance: Any) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_task_that_cannot_be_made_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks, "_factories", dict(tasks._factories))
+
+    def sunk(depth: float = 1.0) -> Any:
+        raise ValueError("it has sunk")
+
+    tasks.register("sunk")(sunk)
+    with pytest.raises(TsbenchError, match=r"^sunk cannot be made: it has sunk$"):
+        tasks.make("sunk")
+    with pytest.raises(TsbenchError, match=r"^sunk cannot be made with \{'depth': 2.0\}: it has"):
+        tasks.make("sunk", depth=2.0)
+
+
 def test_a_new_task_needs_no_list(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "stroll" not in tasks.names()
     monkeypatch.setattr(tasks, "_factories", dict(tasks._factories))

@@ -10,11 +10,11 @@ from typing import Any
 
 from rich.console import Console
 
-from tsbench import tasks
+from tsbench import methods, tasks
 from tsbench.cli.rows import show_rows
 from tsbench.cli.tables import kept_rows
 from tsbench.core.constants import SOURCES, described
-from tsbench.core.task import Task
+from tsbench.core.task import Plannable, Task
 from tsbench.core.words import number
 from tsbench.evaluation import references
 from tsbench.evaluation.words import REFERENCES
@@ -44,7 +44,8 @@ def show(console: Console, name: str) -> dict[str, Any]:
         console.print(f"Sources: {sources}.", markup=False, highlight=False)
     if reached:
         show_rows(console, ("by protocol v1", "solved_reward", "success"), reached)
-    line = f"tsbench run task={name} budget=smoke"
+    method = "" if isinstance(task, Plannable) else f" method={methods.PLANLESS}"
+    line = f"tsbench run task={name}{method} budget=smoke"
     console.print(f"Try it: {line}", markup=False, highlight=False, soft_wrap=True)
     keys = ("name", "value", "unit", "source", "meaning")
     return {

@@ -20,7 +20,10 @@ from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.method import Problem, Workspace
 from tsbench.core.plugins import Plugin, Provider
 from tsbench.core.policy import Policy
+from tsbench.core.task import Plannable
 from tsbench.core.typed import typed
+
+PLANLESS = "monolithic"  # a method that can learn every task, with or without a planning variant
 
 
 class Method(Protocol):
@@ -114,6 +117,21 @@ def options(kind: type[Any], problem: Problem) -> Any:
     """
     given = {key: value for key, value in problem.options.items() if key != "name"}
     return typed(kind, given, "method")
+
+
+def planned_task(problem: Problem, method: str) -> Plannable[Any]:
+    """The problem's task, for a method that needs its planning variant.
+
+    Raises:
+        TsbenchError: the task has none.
+    """
+    task = problem.task
+    if not isinstance(task, Plannable):
+        raise TsbenchError(
+            f"the method {method} needs a planning variant, which {task.name} lacks; "
+            f"method={PLANLESS} needs none"
+        )
+    return task
 
 
 @cache

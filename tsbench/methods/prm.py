@@ -15,7 +15,7 @@ from tsbench.core.method import Problem, Workspace
 from tsbench.core.motion import Plan
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable, roadmap_space
-from tsbench.methods import options
+from tsbench.methods import options, planned_task
 from tsbench.planning.roadmap import cycled, find_route
 from tsbench.rl.stages import AFTER_IMITATION, ImitationOptions, learn_imitation
 from tsbench.sim.kinematic import plan_along, rolled_out
@@ -52,9 +52,9 @@ class Options(ImitationOptions):
 
 def train(problem: Problem, workspace: Workspace) -> Policy:
     chosen: Options = options(Options, problem)
-    task = problem.task
+    task = planned_task(problem, "prm")
     space = roadmap_space(task, "prm")
-    plannable(task).imitation_form(chosen.imitation)  # refuses an unknown form before the planning
+    task.imitation_form(chosen.imitation)  # refuses an unknown form before the planning
     if chosen.roadmap == "layered":
         plan = layered_plan(task)
     else:

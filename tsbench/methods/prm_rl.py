@@ -30,7 +30,7 @@ from tsbench.core.policy import Policy
 from tsbench.core.roadmap import DrivableSpace
 from tsbench.core.state import Rng, S, Start
 from tsbench.core.task import Plant, SimulatedTask, Task, plannable, roadmap_space
-from tsbench.methods import options
+from tsbench.methods import options, planned_task
 from tsbench.planning.roadmap import Graph, Route, connected, no_way, resampled, sampled
 from tsbench.rl.distil import Lesson, distilled
 from tsbench.rl.stages import learn_physics, settings
@@ -87,7 +87,7 @@ class Options:
 
 def train(problem: Problem, workspace: Workspace) -> Policy:
     chosen: Options = options(Options, problem)
-    task = problem.task
+    task = planned_task(problem, "prm_rl")
     space = roadmap_space(task, "prm_rl")
     if not isinstance(space, DrivableSpace):
         raise TsbenchError(f"the method prm_rl cannot do {task.name}: no policy goes to any point")
@@ -99,7 +99,7 @@ def train(problem: Problem, workspace: Workspace) -> Policy:
     route = drivable_route(problem, workspace, space, policy, chosen, testing)
     plan = plan_along(task, space, route.points)
     plan.save(workspace.directory / "plan.npz")
-    plannable(task).reference(plan).save(workspace.directory / "reference.npz")
+    task.reference(plan).save(workspace.directory / "reference.npz")
     route.drawn(space, plan).save(workspace.directory / "roadmap.npz")
     return followed(problem, workspace, space, route, policy, act - driving - testing)
 

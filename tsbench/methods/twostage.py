@@ -14,8 +14,7 @@ from typing import Any
 from tsbench.core.method import Problem, Workspace
 from tsbench.core.motion import Plan
 from tsbench.core.policy import Policy
-from tsbench.core.task import plannable
-from tsbench.methods import options
+from tsbench.methods import options, planned_task
 from tsbench.rl.stages import AFTER_IMITATION, ImitationOptions, learn_imitation, learn_planning
 from tsbench.sim.episodes import PolicyFunction, play
 from tsbench.sim.kinematic import Planning
@@ -40,7 +39,7 @@ class Options(ImitationOptions):
 
 def train(problem: Problem, workspace: Workspace) -> Policy:
     chosen: Options = options(Options, problem)
-    task = plannable(problem.task)
+    task = planned_task(problem, "twostage")
     task.imitation_form(chosen.imitation)  # refuses an unknown form before it costs a stage
     planner = learn_planning(problem, workspace, problem.budget.plan, chosen.explore)
     plan = extract(Planning(task), planner.policy(task, "twostage"))

@@ -88,7 +88,8 @@ def make(name: str, **constants: Any) -> Task[Any]:
     try:
         return factory(**constants)
     except (TypeError, ValueError, OverflowError) as error:
-        raise TsbenchError(f"{name} cannot be made with {constants}: {error}") from None
+        given = f" with {constants}" if constants else ""
+        raise TsbenchError(f"{name} cannot be made{given}: {error}") from None
 
 
 def checked(name: str, **constants: Any) -> Task[Any]:
