@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from tsbench import cli
+from tsbench import cli, tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import Plan
-from tsbench.runs.directory import RunDirectory
+from tsbench.evaluation.protocol import V1
+from tsbench.runs.directory import Record, RunDirectory
 from tsbench.viewer import curves, report
 
 MakeRun = Callable[..., Path]
@@ -32,12 +33,14 @@ def test_a_report_says_what_was_planned_and_done_and_how_good_it_is(make_run: Ma
         "laikago_trot, twostage, seed 0, budget smoke",
         "The plan starts 3.00 m from the goal",
         "In full physics the policy ends 3.01 m from the goal after 6.0 s, which does not solve",
-        '<p class="verdict">SOLVED 40 of 100</p><p>The policy solves the task from 40 of 100',
+        '<p class="verdict">SOLVED 40 of 100</p><p>Not ranked: protocol smoke plays too few',
+        "episodes. The policy solves the task from 40 of 100",
         "perturbed starts. Spoiled by a fall: 25 of 100. Footfall agreement: 0.5 (1 for",
         "feet that stand",
         "Time to the goal, s: 0.5 (of the episodes that arrived).",
         "The policy earns 1.0% of the largest possible reward, which is 0.125 times the reward",
-        "of the best plan. It survives 25% of all pushes of 100 N for 0.1 s. After 12% of all it",
+        "of the best plan. Of all pushes of 100 N for 0.1 s it survives 25.0% and solves the task",
+        "after 12.5%.",
         "Contacts and schedule agree",
         "Foot contacts",
         "feet do not slip",
@@ -62,8 +65,71 @@ def test_what_a_run_lacks_is_left_out(make_run: MakeRun) -> None:
         (run / name).unlink()
     own = words_of(report.render(RunDirectory(run)))
     assert "without a plan" in own
-    for words in ("Foot contacts", "Joints", "How it learned", "physics follow"):
+    for words in ("Foot contacts", "Joints", "How it learned", "physics follow", "Blue", "audit"):
         assert words not in own
+
+
+def test_a_plan_that_fails_its_audit_is_said_first(make_run: MakeRun) -> None:
+    run = make_run("rocket_navigation", 0.7)
+    assert "fails its audit" not in words_of(report.render(RunDirectory(run)))
+    plan = Plan.load(run / "plan.npz")
+    replace(plan, states=0.0 * plan.states).save(run / "plan.npz")
+    words = (
+        r"<h2>What was planned</h2><p>The plan fails its audit: "
+        r"distance of the plan&#x27;s end from the goal 60 m, allowed 1 m.* The plan starts"
+    )
+    assert re.search(words, words_of(report.render(RunDirectory(run))))
+
+
+def test_why_a_score_is_not_ranked_is_said_first(
+    invented_record: Callable[[str], Record],
+) -> None:
+    record = invented_record("rocket_navigation")
+    task = tasks.make("rocket_navigation")
+    smoke = record.score
+    v1 = replace(smoke, protocol="v1", origin=replace(smoke.origin, protocol=V1))
+    changed, few = "the task's constants were changed", "protocol smoke plays too few episodes"
+    for score, standard, reasons in (
+        (v1, False, changed),
+        (smoke, True, few),
+        (smoke, False, f"{changed} and {few}"),
+    ):
+        one = replace(record, score=score, standard=standard)
+        words = report.worth_in_words(one, task)
+        assert words.startswith(f"Not ranked: {reasons}. The policy solves")
+    assert report.worth_in_words(replace(record, score=v1), task).startswith("The policy solves")
+
+
+@pytest.mark.parametrize(
+    ("survived", "recovered", "words"),
+    [
+        (0.0, 0.0, "it survives none."),
+        (0.5, 0.0, "it survives 50.0% and solves the task after none."),
+        (0.5, 1 / 256, "it survives 50.0% and solves the task after 0.4%."),
+    ],
+)
+def test_pushes_that_nothing_survives_are_told_in_words(
+    survived: float, recovered: float, words: str, invented_record: Callable[[str], Record]
+) -> None:
+    record = invented_record("laikago_trot")
+    robustness = replace(record.score.robustness, survival_100N=survived, recovery_100N=recovered)
+    record = replace(record, score=replace(record.score, robustness=robustness))
+    text = report.worth_in_words(record, tasks.make("laikago_trot"))
+    assert text.endswith(f" Of all pushes of 100 N for 0.1 s {words}")
+
+
+def test_a_term_that_is_the_whole_reward_is_drawn_once(make_run: MakeRun) -> None:
+    own = words_of(report.render(RunDirectory(make_run("rocket_navigation", 0.7))))
+    assert re.findall(r">([^<]*) over time</title>", own)[0] == "near the goal = reward"
+    assert "reward over time" not in own.replace("near the goal = reward over time", "")
+    own = words_of(report.render(RunDirectory(make_run("rocket_obstacles", directory="other"))))
+    for title in ("near the goal", "near obstacle 1", "reward"):
+        assert f">{title} over time</title>" in own
+
+
+def test_texts_hold_no_marks_of_another_language(make_run: MakeRun) -> None:
+    own = words_of(report.render(RunDirectory(make_run("laikago_trot"))))
+    assert "`" not in own.partition("<script>")[0]
 
 
 def test_only_finished_runs_have_reports(make_run: MakeRun, tmp_path: Path) -> None:

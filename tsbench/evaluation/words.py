@@ -23,6 +23,19 @@ def verdict(summary: Summary) -> str:
     return f"SOLVED {counts(summary)[0]} of {summary.episodes}"
 
 
+def unranked(score: Score, *, standard: bool) -> str:
+    """Why a score is not ranked; "" for one that can be.
+
+    Args:
+        score: of a policy.
+        standard: whether the task had its standard constants.
+    """
+    reasons = [] if standard else ["the task's constants were changed"]
+    if not score.origin.protocol.ranked:
+        reasons.append(f"protocol {score.protocol} plays too few episodes")
+    return " and ".join(reasons)
+
+
 def episode_rows(score: Score, task: Task[Any]) -> Iterator[tuple[str, str, str]]:
     """Rows of a label, the value from perturbed starts, and the value from the task's own start."""
     own, other = score.nominal, score.perturbed

@@ -126,17 +126,27 @@ def _contacts(bands: Sequence[Band], duration: float, width: float, shown: str) 
 
 
 def rewards(recording: Recording, plan: Recording | None) -> str:
-    """The reward of each step and its terms, executed beside planned."""
+    """The reward of each step and its terms, executed beside planned. A term that is the whole
+    reward is not drawn twice."""
     lines = [("executed", EXECUTED_COLOUR, recording)]
     if plan is not None:
         lines.insert(0, ("plan", PLAN_COLOUR, plan))
+
+    def whole(name: str) -> bool:
+        return all(
+            np.array_equal(r.reward_terms[name], r.reward_terms["reward"]) for _, _, r in lines
+        )
+
+    names = list(recording.reward_terms)
+    titles = {name: name for name in names if not whole(name)}
+    titles["reward"] = " = ".join(filter(whole, names))
     return grid(
         _panel(
             f"reward-{number}",
-            name,
+            title,
             [(what, colour, r.times[1:], r.reward_terms[name]) for what, colour, r in lines],
         )
-        for number, name in enumerate(recording.reward_terms)
+        for number, (name, title) in enumerate(titles.items())
     )
 
 

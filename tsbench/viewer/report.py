@@ -14,11 +14,19 @@ import numpy as np
 
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_new
+from tsbench.core.motion import Audit, AuditItem
 from tsbench.core.task import Task, plannable
 from tsbench.core.words import duration, number
-from tsbench.evaluation.score import Score
-from tsbench.evaluation.words import FIGURES, claim_force, counts, episode_rows, pushes, verdict
-from tsbench.runs.directory import RunDirectory
+from tsbench.evaluation.words import (
+    FIGURES,
+    claim_force,
+    counts,
+    episode_rows,
+    pushes,
+    unranked,
+    verdict,
+)
+from tsbench.runs.directory import Record, RunDirectory
 from tsbench.viewer import charts, curves, page
 from tsbench.viewer.compose import foot_bands
 from tsbench.viewer.pushes import headings
@@ -79,6 +87,7 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
     assert subject.score is not None
     learning = charts.learning(run.metrics_file) if run.has_metrics else None
     plan, recording = subject.plan(), record_episode(subject.task, subject.policy)
+    audit = _audit(subject, run)
     view = page.render(subject.show_of(recording, plan))
     report = page.fill(
         "report.html",
@@ -86,24 +95,36 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
             "title": html.escape(subject.title),
             "plan": page.css(PLAN_COLOUR),
             "executed": page.css(EXECUTED_COLOUR),
-            "answers": "".join(_answers(subject, recording, plan)),
+            "answers": "".join(_answers(subject, recording, plan, audit)),
             "view": html.escape(view),
-            "sections": "".join(_sections(subject, run, recording, plan, learning)),
+            "sections": "".join(_sections(subject, run, recording, plan, learning, audit)),
         },
     )
     return view, report
 
 
-def _answers(subject: Subject, recording: Recording, plan: Recording | None) -> Iterator[str]:
+def _audit(subject: Subject, run: RunDirectory) -> Audit | None:
+    """The audit of the run's plan; None without a plan."""
+    plan = run.plan(subject.task)
+    if plan is None or subject.reference is None:
+        return None
+    return plannable(subject.task).audit(plan, subject.reference)
+
+
+def _answers(
+    subject: Subject, recording: Recording, plan: Recording | None, audit: Audit | None
+) -> Iterator[str]:
     assert subject.score is not None
     score = subject.score.score
     planned = "Nothing: this method trains a policy without a plan."
     if plan is not None:
         planned = planned_in_words(plan) + " A plan ignores physics."
+    if audit is not None and not audit.passed:
+        planned = f"{failures_in_words(audit)} {planned}"
     for kind, title, text in (
         ("plan", "What was planned", planned),
         ("executed", "What was executed", executed_in_words(recording)),
-        ("score", "How good it is", worth_in_words(score, subject.task)),
+        ("score", "How good it is", worth_in_words(subject.score, subject.task)),
     ):
         leads = kind == "score"
         solved = f'<p class="verdict">{verdict(score.perturbed)}</p>' if leads else ""
@@ -112,11 +133,29 @@ def _answers(subject: Subject, recording: Recording, plan: Recording | None) -> 
         )
 
 
-def worth_in_words(score: Score, task: Task[Any]) -> str:
+def failures_in_words(audit: Audit) -> str:
+    """A sentence on what a plan fails its audit by."""
+    found = [
+        f"{item.what} {measured}, allowed {allowed}"
+        for item in audit.failures
+        for measured, allowed in [_amounts(item)]
+    ]
+    return f"The plan fails its audit: {'; '.join(found)}."
+
+
+def _amounts(item: AuditItem) -> tuple[str, str]:
+    """What was measured and what is allowed, with their unit."""
+    return f"{item.value:.3g} {item.unit}".rstrip(), f"{item.limit:.3g} {item.unit}".rstrip()
+
+
+def worth_in_words(record: Record, task: Task[Any]) -> str:
     """The score in sentences, the main figures first."""
+    score = record.score
     perturbed, robustness = score.perturbed, score.robustness
     solved, spoiled = counts(perturbed)
-    text = (
+    reasons = unranked(score, standard=record.standard)
+    text = f"Not ranked: {reasons}. " if reasons else ""
+    text += (
         f"The policy solves the task from {solved} of {perturbed.episodes} perturbed starts. "
         f"Spoiled by {task.mishap}: {spoiled} of {perturbed.episodes}."
     )
@@ -127,12 +166,13 @@ def worth_in_words(score: Score, task: Task[Any]) -> str:
             text += f" ({note})." if note else "."
     text += (
         f" The policy earns {score.normalized_reward:.1%} of the largest possible reward, which is "
-        f"{number(score.against_plan)} times the reward of the best plan. It survives "
-        f"{robustness.survival_100N:.0%} of all pushes of {claim_force(score):.3g} N for "
-        f"{robustness.push_duration_s:g} s. After {robustness.recovery_100N:.0%} of all it also "
-        "solves the task."
+        f"{number(score.against_plan)} times the reward of the best plan. Of all "
+        f"pushes of {claim_force(score):.3g} N for {robustness.push_duration_s:g} s it survives "
     )
-    return text
+    if not robustness.survival_100N:
+        return f"{text}none."
+    recovered = f"{robustness.recovery_100N:.1%}" if robustness.recovery_100N else "none"
+    return f"{text}{robustness.survival_100N:.1%} and solves the task after {recovered}."
 
 
 def _sections(
@@ -141,6 +181,7 @@ def _sections(
     recording: Recording,
     plan: Recording | None,
     learning: str | None,
+    audit: Audit | None,
 ) -> Iterator[str]:
     assert subject.score is not None
     duration = max(r.duration for r in (recording, plan) if r is not None)
@@ -154,10 +195,11 @@ def _sections(
             f"the foot in full physics. {agreement_in_words(recording)}",
             charts.contacts(bands, duration),
         )
+    planned = f"Blue: the reward of the plan, as if the {robot} followed it exactly. "
     yield _section(
         "Reward of each step",
-        f"The reward of the task and its terms. Blue: the reward of the plan, as if the {robot} "
-        "followed it exactly. Orange: the reward of the executed motion.",
+        f"The reward of the task and its terms. {planned if plan else ''}Orange: the reward of the "
+        "executed motion.",
         charts.rewards(recording, plan),
     )
     if plan is not None:
@@ -193,9 +235,9 @@ def _sections(
         )
     yield _section(
         "Numbers",
-        f"Everything on this page comes from {run.path.name}/. `tsbench evaluate` makes the score "
-        "again. config.yaml and versions.json tell how the run was made.",
-        f'<div class="tables">{"".join(_tables(subject, run, plan))}</div>',
+        f"Everything on this page comes from {run.path.name}/. The command tsbench evaluate makes "
+        "the score again. config.yaml and versions.json tell how the run was made.",
+        f'<div class="tables">{"".join(_tables(subject, plan, audit))}</div>',
     )
 
 
@@ -207,7 +249,7 @@ def agreement_in_words(recording: Recording) -> str:
     return f"Contacts and schedule agree {share:.0%} of the time."
 
 
-def _tables(subject: Subject, run: RunDirectory, planned: Recording | None) -> Iterator[str]:
+def _tables(subject: Subject, planned: Recording | None, audit: Audit | None) -> Iterator[str]:
     assert subject.score is not None
     yield _table(_score_rows(subject, planned))
     changes = [
@@ -223,14 +265,11 @@ def _tables(subject: Subject, run: RunDirectory, planned: Recording | None) -> I
         for stage in subject.score.stages
     ]  # fmt: skip
     yield _table([("stage", "environment steps", "physics steps", "time"), *costs])
-    plan = run.plan(subject.task)
-    if plan is not None and subject.reference is not None:
-        audit = plannable(subject.task).audit(plan, subject.reference)
+    if audit is not None:
         items = [
-            (item.what, f"{item.value:.3g} {item.unit}", f"{item.limit:.3g} {item.unit}",
-             "ok" if item.passed else "too much")
+            (item.what, *_amounts(item), "ok" if item.passed else "too much")
             for item in audit.items
-        ]  # fmt: skip
+        ]
         yield _table([("can physics follow the plan?", "measured", "allowed", ""), *items])
 
 
