@@ -92,6 +92,9 @@ def test_tables_in_markdown(board: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert re.search(r"\| one \| [0-9.]+ \| \d+% \|.*\| re-scored \| 7 \| 1 \|", text)
     assert re.search(r"\| oracle \| 0\.\d+ \|  \| 1 \|  \| - \|  \|  \| reference \|", text)
     assert "retracted: a bug" in text
+    assert re.search(
+        r"\| steps \| time \| state \|.*\n\|[-|]+\|\n\| one \|.*\| \d+:\d\d \| re-", text
+    )
     assert cli.main(["leaderboard", "--board", str(board), "--readme"]) == 0
     assert (board / "README.md").read_text() == text
 
@@ -127,6 +130,17 @@ def test_texts_of_an_entry_are_nothing_but_text(site: Path) -> None:
     assert (site / TASK / "ten" / "seed3.html").read_text() == "<p>seed3</p>"
     manifest = (site / TASK / "ten" / "manifest.json").read_bytes()
     assert submission.Manifest.decode(manifest).described.entry == "ten"
+
+
+def test_a_site_says_what_a_mean_the_oracle_and_a_time_are(site: Path) -> None:
+    index = (site / "index.html").read_text()
+    assert f'<p class="quiet">{page.ORACLE.replace(chr(39), "&#39;")}</p>' in index
+    assert ">time</button>" in index
+    assert re.search(r'<td class="minor" data-value="[\d.]+">\d+:\d\d</td>', index)
+    of_all = rf"\d+ of {V1.perturbed} starts"
+    one, ten = ((site / TASK / name / "index.html").read_text() for name in ("one", "ten"))
+    assert re.search(rf"best known; solves {of_all}\. 1\s", one)
+    assert re.search(rf"best known; its trainings solve {of_all} on average\. 10\s", ten)
 
 
 def test_the_guide_leaves_the_same_claims_as_an_entry_s_page() -> None:

@@ -212,7 +212,7 @@ def markdown(found: Sequence[Table], left_out: Sequence[str], before: str) -> st
     for table in found:
         lines += ["", f"## {table.task}", ""]
         head = ["entry", "solved_reward", "of the best known", "success", table.measure[0]]
-        head += ["survival_100N", "steps", "seconds", "state", "tuning trials", "seeds"]
+        head += ["survival_100N", "steps", "time", "state", "tuning trials", "seeds"]
         lines += [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
         for row in table.rows:
             figures, (steps, _, seconds) = row.figures, row.cost
