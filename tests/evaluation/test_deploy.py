@@ -145,6 +145,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert cli.main(["export", "rocket_navigation/prm", f"{out}1"]) == 0  # a kept entry
     assert (Path(f"{out}1") / "policy.onnx").is_file()
     (tmp_path / "p.onnx").touch()
+    exported, other = str(out / "policy.onnx"), [f"task={TASK.name}", f"{out}2", "--method", "mine"]
     for words, line in (
         ([str(run), str(out)], "exists"),
         ([str(run), f"{out}2", "--method", "mine"], "--method is for a policy of another library"),
@@ -153,6 +154,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         ([str(run), "task=laikago_trot", f"{out}2"], "for rocket_navigation, not for laikago_trot"),
         ([str(tmp_path / "p.onnx"), f"{out}2"], "task=NAME is missing"),
         ([str(tmp_path / "p.onnx"), f"task={TASK.name}", f"{out}2"], "--method NAME is missing"),
+        ([exported, *other], f"{exported} is an export of tsbench: give the directory of the"),
     ):
         assert cli.main(["export", *words]) == 2
         (error,) = capsys.readouterr().err.splitlines()

@@ -470,6 +470,12 @@ def test_stable_baselines3_files_are_not_loaded_unasked(baseline: tuple[Path, PP
         foreign.load(baseline[0], tasks.make("laikago_walk"), "PPO")
 
 
+def test_a_stable_baselines3_file_of_another_algorithm(baseline: tuple[Path, PPO]) -> None:
+    words = r"model\.zip, or not one that SAC saved: 'ActorCriticPolicy' object has no attribute"
+    with pytest.raises(TsbenchError, match=words):
+        foreign.load(baseline[0], TASK, "SAC")
+
+
 def test_a_damaged_stable_baselines3_file(tmp_path: Path) -> None:
     (tmp_path / "m.zip").write_bytes(b"nonsense")
     with pytest.raises(TsbenchError, match="damaged stable-baselines3 file"):

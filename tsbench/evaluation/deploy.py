@@ -19,7 +19,7 @@ from tsbench.core.files import write_whole
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task
 from tsbench.evaluation import foreign
-from tsbench.evaluation.export import SAME, observations
+from tsbench.evaluation.export import PRODUCER, SAME, observations
 
 OPSET = 17  # of ONNX, 2022: onnxruntime reads it from release 1.12 on
 IR_VERSION = 8  # of ONNX's file format, which belongs to that opset
@@ -141,7 +141,7 @@ def as_onnx(policy: Policy, task: Task[Any]) -> bytes:
         graph,
         opset_imports=[make.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
-        producer_name="tsbench",
+        producer_name=PRODUCER,
     )
     told = {
         "task": info.task,

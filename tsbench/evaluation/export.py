@@ -29,6 +29,7 @@ from tsbench.sim.physics import Physics
 
 SAME = 1e-4  # by which actions may differ: float32 sums in another order, over some layers
 SAMPLES = 400  # random observations of the comparison, beside those of the perturbed starts
+PRODUCER = "tsbench"  # in the ONNX files that `deploy` writes
 RSL_EPSILON = 1e-2  # of EmpiricalNormalization in rsl_rl/modules/normalization.py
 
 # Names of operations in torch and ONNX.
@@ -285,7 +286,8 @@ def from_onnx(path: Path, mdp: MDP[Any]) -> Found:
     """
     policy = foreign.from_onnx(path, mdp)  # also refuses files of other sizes
     onnx = foreign.extra("onnx", "onnx")
-    graph = foreign.read_onnx(path)[0].graph
+    model = foreign.read_onnx(path)[0]
+    graph = model.graph
     values = {one.name: onnx.numpy_helper.to_array(one) for one in graph.initializer}
     for node in graph.node:
         if node.op_type == "Constant":
@@ -304,6 +306,11 @@ def from_onnx(path: Path, mdp: MDP[Any]) -> Found:
         try:
             _add_node(found, node.op_type, names.index(given), others, attributes)
         except TsbenchError as error:
+            if model.producer_name == PRODUCER:  # the policy file can express more than a chain
+                raise TsbenchError(
+                    f"{path} is an export of tsbench: give the directory of the policy that it "
+                    "was written from"
+                ) from None
             raise TsbenchError(f"{path}: {error}") from None
         given = node.output[0]
     if given != graph.output[0].name:

@@ -348,7 +348,10 @@ def from_sb3(
     try:
         model = getattr(package, algorithm).load(io.BytesIO(content[0]), device="cpu")
     except Exception as error:  # pickle, zipfile and torch raise anything
-        raise TsbenchError(f"damaged stable-baselines3 file {path}: {_line(error)}") from None
+        raise TsbenchError(
+            f"damaged stable-baselines3 file {path}, or not one that {algorithm} saved: "
+            f"{_line(error)}"
+        ) from None
     normalize = None
     if vecnormalize is not None:
         content.append(read(vecnormalize))
