@@ -126,8 +126,8 @@ def load_batched(
         threads: CPU threads of the physics; None takes all cores.
 
     Raises:
-        TsbenchError: `count` is less than 1, or there are more or fewer seeds. Beyond that, as
-            `load`.
+        TsbenchError: `count` is no whole number or less than 1, or there are more or fewer seeds.
+            Beyond that, as `load`.
     """
     from tsbench.sim.batched import BatchedEnvironment
     from tsbench.sim.kinematic import Planning
@@ -136,6 +136,10 @@ def load_batched(
     for one in seed if isinstance(seed, Sequence) else [seed]:
         _check_seed(one)
     mdp = _variant(name, variant, reference, perturbed, push, constants)
+    try:
+        count = operator.index(count)
+    except TypeError:
+        raise TsbenchError(f"count must be a whole number, not {quoted(count)}") from None
     if count < 1:
         raise TsbenchError(f"count must be at least 1, not {count}")
     if isinstance(seed, Sequence) and len(seed) != count:

@@ -223,6 +223,25 @@ def test_refused_seeds(seed: Any, message: str) -> None:
             tsbench.load("rocket_navigation", seed=seed)
 
 
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [
+        (0, "count must be at least 1, not 0"),
+        ("a", "count must be a whole number, not 'a'"),
+        (2.0, r"count must be a whole number, not 2\.0"),
+        (None, "count must be a whole number, not None"),
+    ],
+)
+def test_refused_counts(count: Any, message: str) -> None:
+    with pytest.raises(TsbenchError, match=f"^{message}$"):
+        tsbench.load_batched("rocket_navigation", count=count)
+
+
+def test_a_count_may_be_one_of_numpy() -> None:
+    count: Any = np.int64(2)
+    assert tsbench.load_batched("rocket_navigation", count=count, threads=1).count == 2
+
+
 # Nothing is stepped that has no state to go on from.
 
 
