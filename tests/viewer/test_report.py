@@ -150,6 +150,8 @@ def test_the_command_writes_it_beside_the_run(
     assert (run / "report.html").read_text("utf-8").startswith("<!DOCTYPE html>")
     assert cli.main(["report", str(run)]) == 2
     assert "nothing is overwritten: give another by --html FILE" in capsys.readouterr().err
+    assert cli.main(["report", str(run), "--html", "report.png"]) == 2
+    assert capsys.readouterr().err == "tsbench: report.png must end in .html\n"
 
 
 def test_what_does_not_belong_to_the_run_is_refused(

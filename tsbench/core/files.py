@@ -216,6 +216,16 @@ def taken(place: Path, holds: str = "", way_out: str = "") -> TsbenchError:
     return TsbenchError(f"{place} {state} and nothing is overwritten{rest}")
 
 
+def check_ending(path: Path, ending: str) -> None:
+    """Checks that a file's name ends as files of its kind do, such as ".png".
+
+    Raises:
+        TsbenchError: it has another ending.
+    """
+    if path.suffix.lower() != ending:
+        raise TsbenchError(f"{path} must end in {ending}")
+
+
 def check_new(path: Path, way_out: str = "", *, parents: bool = False) -> None:
     """Checks that a new file or directory can be made.
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from tsbench.core.errors import TsbenchError
-from tsbench.core.files import check_new
+from tsbench.core.files import check_ending, check_new
 from tsbench.viewer import scene
 from tsbench.viewer.framing import Framing, framing
 from tsbench.viewer.scene import Array
@@ -61,7 +61,8 @@ def write_video(show: Show, path: Path, progress: Progress | None = None) -> Non
     Raises:
         TsbenchError: no OpenGL or no encoder works here, or the file exists or cannot be written.
     """
-    _refuse(path, ".mp4")
+    check_ending(path, ".mp4")
+    check_new(path)
     if imageio_ffmpeg is None:
         raise TsbenchError("videos need an encoder: pip install 'tsbench[video]' (imageio-ffmpeg)")
     temporary = path.with_name(path.name + ".part.mp4")  # ffmpeg chooses the format by the ending
@@ -94,7 +95,8 @@ def write_strip(show: Show, path: Path, count: int = 6) -> None:
     Raises:
         TsbenchError: no OpenGL works here, or the file exists or cannot be written.
     """
-    _refuse(path, ".png")
+    check_ending(path, ".png")
+    check_new(path)
     rows = sorted(show.actors, key=lambda actor: not actor.ghost)
     gutter, header = 110, 34
     strip = Image.new("RGB", (gutter + count * CELL, header + len(rows) * CELL), "white")
@@ -430,17 +432,6 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _bytes(colour: Rgb) -> tuple[int, int, int]:
     red, green, blue = (round(255 * value) for value in colour)
     return red, green, blue
-
-
-def _refuse(path: Path, ending: str) -> None:
-    """Checks the path of a new file.
-
-    Raises:
-        TsbenchError: the file exists or cannot be made, or its name has another ending.
-    """
-    if path.suffix.lower() != ending:
-        raise TsbenchError(f"{path} must end in {ending}")
-    check_new(path)
 
 
 @contextlib.contextmanager

@@ -15,13 +15,14 @@ def call(words: Sequence[str]) -> None:
     what = "the new page (the missing ones of report.html and view.html in RUN)"
     parser.add_argument("--html", type=places.path, metavar="FILE", help=what)
     options = parser.parse_args(words)
-    from tsbench.core.files import check_new, write_new
+    from tsbench.core.files import check_ending, check_new, write_new
     from tsbench.runs.directory import RunDirectory
     from tsbench.viewer import report
 
     run = RunDirectory(places.run(options.run))
     report.check_finished(run)
     path = options.html or run.report_file
+    check_ending(path, ".html")
     check_new(path, "give another by --html FILE")
     if options.html:
         write_new(path, report.render(run).encode())

@@ -19,12 +19,12 @@ def call(words: Sequence[str]) -> None:
     push = "push the robot for 0.1 s, e.g. 100N@0.5s:+y: newtons, when, where to (axis or degrees)"
     parser.add_argument("--push", metavar="PUSH", help=push)
     files = {
-        "--html": "write a page, open no server",
-        "--video": "write an MP4",
-        "--strip": "write a PNG of some moments",
+        "html": ("write a page, open no server", ".html"),
+        "video": ("write an MP4", ".mp4"),
+        "strip": ("write a PNG of some moments", ".png"),
     }
-    for flag, purpose in files.items():
-        parser.add_argument(flag, type=new_file, metavar="FILE", help=purpose)
+    for name, (purpose, _) in files.items():
+        parser.add_argument(f"--{name}", type=new_file, metavar="FILE", help=purpose)
     port = "of the live view (any that is free)"
     parser.add_argument("--port", type=_port, metavar="N", default=0, help=port)
     options = parser.parse_args(words)
@@ -32,12 +32,15 @@ def call(words: Sequence[str]) -> None:
         parser.error("one of RUN|PLAN|task=NAME and --compare RUN RUN is needed")
     from rich.console import Console
 
-    from tsbench.core.files import write_new
+    from tsbench.core.files import check_ending, write_new
     from tsbench.runs.progress import progress_bar
     from tsbench.viewer import film, page, serve
     from tsbench.viewer.show import Show
     from tsbench.viewer.subject import pair, subject
 
+    for name, (_, ending) in files.items():
+        if path := getattr(options, name):
+            check_ending(path, ending)
     compared = [str(places.run(word)) for word in options.compare or ()]
     chosen = options.what or ""
     if chosen and not chosen.startswith("task="):
@@ -54,7 +57,7 @@ def call(words: Sequence[str]) -> None:
             film.write_video(shown, options.video, progress)
     if options.strip:
         film.write_strip(shown, options.strip)
-    written = [str(path) for path in (options.html, options.video, options.strip) if path]
+    written = [str(path) for name in files if (path := getattr(options, name))]
     if written:
         sys.stdout.write("\n".join(written) + "\n")
         return
