@@ -29,7 +29,7 @@ from tsbench.core import plugins
 from tsbench.core.constants import SOURCES, described
 from tsbench.core.files import write_whole
 from tsbench.core.task import MDP, Plannable, Task
-from tsbench.core.words import duration, number
+from tsbench.core.words import duration, number, several
 from tsbench.leaderboard import page
 from tsbench.leaderboard.page import Row, Table, short
 from tsbench.runs import schema
@@ -106,8 +106,8 @@ def task_card(table: Table) -> str:
         _results(table),
         BEST_PLAN,
         "## Observation and action",
-        f"An observation has {task.observation_size} numbers. {_prose(own.observation)}",
-        f"An action has {task.action_size} numbers in [-1, 1]. {_prose(own.control)}",
+        f"An observation has {several(task.observation_size, 'number')}. {_prose(own.observation)}",
+        f"An action has {several(task.action_size, 'number')} in [-1, 1]. {_prose(own.control)}",
         "## Reward",
         f"At most {number(task.max_reward)} a step. {_prose(own.reward)}",
         _literal(own.reward_terms),
@@ -268,8 +268,8 @@ def _glance(task: Task[Any]) -> Iterable[tuple[str, str]]:
     yield "episode", f"{task.horizon} steps of {number(task.timestep)} s"
     rate = number(task.substeps / task.timestep)
     yield "physics", f"{task.substeps} steps in a control step, {rate} Hz"
-    yield "observation", f"{task.observation_size} numbers"
-    yield "action", f"{task.action_size} numbers in [-1, 1]"
+    yield "observation", several(task.observation_size, "number")
+    yield "action", f"{several(task.action_size, 'number')} in [-1, 1]"
     yield "reward of a step", f"at most {number(task.max_reward)}"
     yield "pushes", f"on the body `{task.pushed}` at {len(task.push_steps)} instants"
 
@@ -286,8 +286,8 @@ def _variants(task: Plannable[Any]) -> list[str]:
     rows = [
         ("plan", f"{plan.horizon} steps of {number(plan.timestep)} s"),
         ("coordinates of a plan", ", ".join(f"`{name}`" for name in plan.coordinates)),
-        ("action of the planner", f"{plan.action_size} numbers in [-1, 1]"),
-        ("observation of the planner", f"{plan.observation_size} numbers"),
+        ("action of the planner", f"{several(plan.action_size, 'number')} in [-1, 1]"),
+        ("observation of the planner", several(plan.observation_size, "number")),
         ("imitation rewards", f"{forms} (the first is the default)"),
     ]
     tracker = inspect.signature(type(task).tracker).return_annotation

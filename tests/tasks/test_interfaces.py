@@ -6,6 +6,7 @@ The cart is a minimal task: a mass on a rail that has to stop at a mark.
 from __future__ import annotations
 
 import io
+import re
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -225,7 +226,10 @@ def test_the_card_of_a_task_without_a_plan_suggests_a_method_that_can_learn_it(
     console = Console(file=io.StringIO(), record=True)
     describe.show(console, "cart")
     words = "Try it: tsbench run task=cart method=monolithic budget=smoke"
-    assert console.export_text().splitlines()[-1] == words
+    shown = console.export_text()
+    assert shown.splitlines()[-1] == words
+    assert re.search(r" action +1 number in \[-1, 1\]", shown)
+    assert re.search(r" observation +2 numbers", shown)
 
 
 def test_a_task_with_other_tracking_data(tmp_path: Path) -> None:

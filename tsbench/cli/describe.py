@@ -15,7 +15,7 @@ from tsbench.cli.rows import show_rows
 from tsbench.cli.tables import kept_rows
 from tsbench.core.constants import SOURCES, described
 from tsbench.core.task import Plannable, Task
-from tsbench.core.words import number
+from tsbench.core.words import number, several
 from tsbench.evaluation import references
 from tsbench.evaluation.words import REFERENCES
 from tsbench.runs import schema
@@ -63,8 +63,8 @@ def show(console: Console, name: str) -> dict[str, Any]:
 def _facts(task: Task[Any]) -> Iterator[tuple[str, str]]:
     own = type(task)
     seen, done = _own(task, own.observation), _own(task, own.control)
-    yield "observation", f"{task.observation_size} numbers. {seen}".strip()
-    yield "action", f"{task.action_size} numbers in [-1, 1]. {done}".strip()
+    yield "observation", f"{several(task.observation_size, 'number')}. {seen}".strip()
+    yield "action", f"{several(task.action_size, 'number')} in [-1, 1]. {done}".strip()
     reward = _own(task, own.reward)
     yield "reward", f"at most {number(task.max_reward)} a step. {reward}".strip()
     if terms := _own(task, own.reward_terms):

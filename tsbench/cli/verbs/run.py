@@ -23,7 +23,8 @@ words, in Hydra's grammar:
   threads=N        CPU threads (all)
   checkpoint=S     seconds of training between checkpoints (30)
   loggers=[...]    what shows the training: tensorboard, wandb, mlflow ([tensorboard])
-  device=NAME      what learns: cpu, cuda, cuda:N, or auto for a GPU where there is one (cpu)
+  device=NAME      what learns: cpu, cuda, cuda:N, auto for a GPU where there is one, or warp for
+                   tests of a GPU's code on the CPU (cpu)
   deterministic=true
                    the same bits each time on a GPU, for more time
   resume=RUN       continues an interrupted run to the same result, bit for bit; takes no other

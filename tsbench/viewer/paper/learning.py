@@ -112,12 +112,13 @@ def _exhibit(
             tidy(panel)
             panel.set(ylabel="normalized return", xlim=(0.0, None))
         panels[-1].set_xlabel(axis.label)
+        scored = "finished policy, on the task's reward"
         legend(
             figure, groups,
             [
                 Line2D([], [], color="grey", ls=PLANNING, label="planning stage"),
                 Line2D([], [], color="grey", label="stage in physics"),
-                Line2D([], [], color="grey", ls="", marker="o", label="finished policy, on R"),
+                Line2D([], [], color="grey", ls="", marker="o", label=scored),
             ],
         )  # fmt: skip
     return Exhibit(
@@ -127,9 +128,9 @@ def _exhibit(
         "of its own reward, as in the paper; episodes of an imitation stage begin anywhere along "
         "the reference, so that even a perfect one stays below 1. The curve of prm_rl is that of "
         "driving from point to point, which is an easier task; its other stages have none. Dots "
-        "stand for the finished policies on the task's own reward R, from the protocol's perturbed "
-        "starts: they alone can "
-        f"be compared between methods.{axis.note}",
+        "stand for the finished policies on the task's own reward, from the protocol's perturbed "
+        "starts: they alone can be "
+        f"compared between methods.{axis.note}",
         figure=figure,
         claims=claims,
         columns=("task", "method", "seed", "stage", axis.name, "normalized_return"),
