@@ -92,6 +92,7 @@ def test_tables_in_markdown(board: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert re.search(r"\| one \| [0-9.]+ \| \d+% \|.*\| re-scored \| 7 \| 1 \|", text)
     assert re.search(r"\| oracle \| 0\.\d+ \|  \| 1 \|  \| - \|  \|  \| reference \|", text)
     assert "retracted: a bug" in text
+    assert page.COLUMNS in text
     assert re.search(
         r"\| steps \| time \| state \|.*\n\|[-|]+\|\n\| one \|.*\| \d+:\d\d \| re-", text
     )

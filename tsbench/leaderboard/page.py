@@ -21,7 +21,7 @@ from tsbench.core.files import taken, write_whole
 from tsbench.core.words import duration, number
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import stored
-from tsbench.evaluation.statistics import Aggregate, aggregate
+from tsbench.evaluation.statistics import RANKED_SEEDS, Aggregate, aggregate
 from tsbench.evaluation.words import FIGURES
 from tsbench.leaderboard.submission import MANIFEST, Entry, read_entry
 from tsbench.leaderboard.verify import (
@@ -95,6 +95,14 @@ class Row:
 ORACLE = (
     "oracle: the best plan, as if physics followed it exactly. The planner's speed limits bind it "
     "and do not bind physics, so an entry may earn more."
+)
+
+
+COLUMNS = (
+    "solved_reward: the interquartile mean over an entry's trainings, from "
+    f"{RANKED_SEEDS} on with a 95 % interval; the other figures are their means. steps, time: of "
+    "one training. tuning trials: choices of settings that were tried before. seeds: trainings "
+    "that are kept."
 )
 
 
@@ -234,7 +242,7 @@ def markdown(found: Sequence[Table], left_out: Sequence[str], before: str) -> st
                 number(given.get("survival_100N")), "", "", "reference", "", "",
             ]  # fmt: skip
             lines.append(f"| {' | '.join(cells)} |")
-    lines += ["", ORACLE]
+    lines += ["", COLUMNS, "", ORACLE]
     if left_out:
         lines += ["", "Not shown:", "", *(f"- {as_markdown(line)}" for line in left_out)]
     return "\n".join(lines) + "\n"
