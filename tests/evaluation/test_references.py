@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +17,14 @@ from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import POLICIES, beside, random, stored
 
 KEPT = {name: rows for name in tasks.names() if (rows := stored(name)) is not None}
+
+
+def test_a_wrong_name_gets_one_line() -> None:
+    line = [sys.executable, "-m", "tsbench.evaluation.references", "rocket_navigatoin"]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("tsbench: unknown task 'rocket_navigatoin'; allowed: ")
+    assert done.stderr.count("\n") == 1
 
 
 def test_there_are_some() -> None:

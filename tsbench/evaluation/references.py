@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tsbench import tasks
-from tsbench.core.errors import unknown
+from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.task import MDP, Task
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.foreign import ForeignPolicy, from_function
@@ -140,4 +140,8 @@ def comparable(score: Score) -> dict[str, dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or tasks.names())
+    try:
+        main(sys.argv[1:] or tasks.names())
+    except TsbenchError as error:
+        sys.stderr.write(f"tsbench: {error}\n")
+        sys.exit(2)
