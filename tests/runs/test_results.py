@@ -205,7 +205,7 @@ def test_the_policies_of_the_best_the_median_and_the_worst_seed_stay(
 
 
 def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TsbenchError, match="no directory"):
+    with pytest.raises(TsbenchError, match="there is no directory"):
         results.read([tmp_path / "nowhere"])
     with pytest.raises(TsbenchError, match="holds no finished run, no entry and no results"):
         results.read([tmp_path])

@@ -71,8 +71,11 @@ def seeds(word: str) -> list[int]:
     found: list[int] = []
     for part in word.split(","):
         first, dash, last = part.partition("-")
-        low = whole_number(first, 0, 2**32 - 1)
-        high = whole_number(last, low, 2**32 - 1) if dash else low
+        try:
+            low = whole_number(first, 0, 2**32 - 1)
+            high = whole_number(last, low, 2**32 - 1) if dash else low
+        except argparse.ArgumentTypeError as error:
+            raise argparse.ArgumentTypeError(f"needs seeds such as 0-2,5: {error}") from None
         if high - low >= 1000:
             raise argparse.ArgumentTypeError(f"more than 1000 seeds: {part!r}")
         found += range(low, high + 1)

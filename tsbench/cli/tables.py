@@ -24,6 +24,7 @@ from tsbench.evaluation.words import (
     episode_rows,
     push_rows,
     reference_rows,
+    unranked,
     verdict,
 )
 from tsbench.leaderboard import kept
@@ -187,8 +188,5 @@ def show_places(console: Console, run: RunDirectory) -> None:
 
 def show_rank(console: Console, standard: bool, score: Score) -> None:
     """Prints why a score is not ranked, if so."""
-    reasons = [] if standard else ["the task's constants were changed"]
-    if not score.origin.protocol.ranked:
-        reasons.append(f"protocol {score.protocol} plays too few episodes")
-    if reasons:
-        console.print(f" not ranked: {' and '.join(reasons)}", highlight=False)
+    if reasons := unranked(score, standard=standard):
+        console.print(f" not ranked: {reasons}", highlight=False)

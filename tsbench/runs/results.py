@@ -200,7 +200,7 @@ def read(paths: Sequence[Path]) -> Results:
     found = Results()
     for path in paths:
         if not path.is_dir():
-            raise TsbenchError(f"no directory {path}")
+            raise TsbenchError(f"there is no directory {path}")
         parts = list(_parts(path))
         if not parts:
             raise TsbenchError(f"{path} holds no finished run, no entry and no results")
