@@ -153,3 +153,39 @@ def test_a_run_without_a_configuration_is_coherent(run: RunDirectory) -> None:
     run.config_file.unlink()
     run.versions_file.unlink()
     check(run)
+
+
+def spent(run: RunDirectory, more: int) -> None:
+    """Lets the stage in physics have taken so many steps more than the budget has for both."""
+    stages = json.loads(run.score_file.read_text())["stages"]
+    budget = run.config().task.budgets["paper"]
+    steps = budget.plan + budget.act + more - stages[0]["steps"]
+    substeps = stages[1]["physics_substeps"] // stages[1]["steps"] * steps
+    stage(steps=steps, physics_substeps=substeps)(run)
+
+
+def test_a_stage_may_finish_an_iteration_of_all_processes(run: RunDirectory) -> None:
+    training = run.config().task.training
+    sizes = [one.get("environments", 512) * one.get("rollout", 24) for one in training.values()]
+    iteration = max(512 * 24, *sizes)
+    spent(run, 2 * iteration)
+    check(run)
+    spent(run, 2 * iteration + 1)
+    with pytest.raises(
+        TsbenchError, match=r"score\.json: 5,0\d\d,\d\d\d steps used, where the bud"
+    ):
+        check(run)
+    versions(processes=2)(run)
+    check(run)
+    spent(run, 4 * iteration + 1)
+    with pytest.raises(TsbenchError, match=r"steps used, where the budget paper has 5,000,000"):
+        check(run)
+
+
+@pytest.mark.parametrize("rollout", ["true", "x", "[1]", "-5", "1e3", "null"])
+def test_a_rollout_that_is_no_count_allows_nothing(run: RunDirectory, rollout: str) -> None:
+    """It is another configuration than the one that versions.json names, which is told."""
+    hashed(text("config.yaml", "rollout: 16", f"rollout: {rollout}"))(run)
+    spent(run, 10**6)
+    with pytest.raises(TsbenchError):
+        check(run)

@@ -21,7 +21,14 @@ from tsbench.core.policy import MAX_INFO, encode_info
 from tsbench.core.task import Task
 from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.score import Score
-from tsbench.runs.directory import MAX_CONFIG, MAX_SCORE, MAX_VERSIONS, Record, RunDirectory
+from tsbench.runs.directory import (
+    MAX_CONFIG,
+    MAX_SCORE,
+    MAX_VERSIONS,
+    Record,
+    RunDirectory,
+    overspent,
+)
 from tsbench.runs.schema import ELSEWHERE, encode, identity_hash
 
 _HASH = re.compile(r"[0-9a-f]{64}")
@@ -57,6 +64,10 @@ def check(run: RunDirectory, record: Record, task: Task[Any]) -> None:
     for path, found in faults:
         for fault in found:
             raise TsbenchError(f"{path}: {fault}")
+    if settings is not None:
+        processes = (versions or {}).get("processes", 1)
+        if more := overspent(record.stages, run.config(), processes):
+            raise TsbenchError(f"{run.score_file}: {more}")
     for path, content, written in _written(run, settings):
         if content != written:
             raise TsbenchError(f"{path} is not written as tsbench writes it")

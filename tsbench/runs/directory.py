@@ -79,12 +79,17 @@ class Stage:
     interruptions: int = 0
 
 
-def overspent(stages: Sequence[Stage], config: RunConfig) -> str:
+def overspent(stages: Sequence[Stage], config: RunConfig, processes: int = 1) -> str:
     """By how much the stages go beyond the run's budget, in words, or "" if they do not.
 
     A stage may finish the iteration in which its budget ends: the actions of all its environments
     between two updates. The largest iteration of the configuration is allowed to each stage, since
     a method's stages need not bear the names of their settings.
+
+    Args:
+        stages: what they used.
+        config: of the run.
+        processes: that trained together, each with the environments of the configuration.
     """
     allowed = config.task.budgets[config.budget]
     most, name = allowed.plan + allowed.act, f"the budget {config.budget}"
@@ -93,7 +98,8 @@ def overspent(stages: Sequence[Stage], config: RunConfig) -> str:
         return f"stages of {planned:,} steps, where {name} has {most:,}"
     used = sum(stage.steps for stage in stages)
     together = allowed.environments
-    iteration = max(_iteration(each, together) for each in ({}, *config.task.training.values()))
+    kinds = ({}, *config.task.training.values())
+    iteration = processes * max(_iteration(each, together) for each in kinds)
     if used > most + len(stages) * iteration:
         rest = f"and lets a stage finish an iteration of {iteration:,}"
         return f"{used:,} steps used, where {name} has {most:,} {rest}"

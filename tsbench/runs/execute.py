@@ -278,7 +278,7 @@ def _train(
         other = policy.info.method
         raise TsbenchError(f"the method {name} returns a policy that names the method {other}")
     check_fit(policy, problem.task)
-    if more := overspent(workspace.stages, config):
+    if more := overspent(workspace.stages, config, processes.count()):
         workspace.note(f"over the budget, so no leaderboard takes this run: {more}")
     policy.save(run.path)
     protocol = SMOKE if config.budget == SMOKE.name else V1
