@@ -13,7 +13,8 @@ import pytest
 from tsbench.core.errors import TsbenchError
 from tsbench.core.files import encode_json
 from tsbench.leaderboard import coherence
-from tsbench.runs.directory import RunDirectory
+from tsbench.runs import config
+from tsbench.runs.directory import RunDirectory, Stage, overspent
 from tsbench.runs.schema import encode, identity_hash
 
 BOARD = Path(__file__).parents[2] / "leaderboards"
@@ -164,22 +165,15 @@ def spent(run: RunDirectory, more: int) -> None:
     stage(steps=steps, physics_substeps=substeps)(run)
 
 
-def test_a_stage_may_finish_an_iteration_of_all_processes(run: RunDirectory) -> None:
-    training = run.config().task.training
-    sizes = [one.get("environments", 512) * one.get("rollout", 24) for one in training.values()]
-    iteration = max(512 * 24, *sizes)
-    spent(run, 2 * iteration)
+def test_the_processes_of_a_run_are_those_that_it_names(run: RunDirectory) -> None:
+    """512 * 24 steps for each of two stages, and of two processes twice as many."""
+    spent(run, 2 * 512 * 24)
     check(run)
-    spent(run, 2 * iteration + 1)
-    with pytest.raises(
-        TsbenchError, match=r"score\.json: 5,0\d\d,\d\d\d steps used, where the bud"
-    ):
+    spent(run, 2 * 512 * 24 + 1)
+    with pytest.raises(TsbenchError, match=r"score\.json: 5,024,577 steps used, where the budget"):
         check(run)
     versions(processes=2)(run)
     check(run)
-    spent(run, 4 * iteration + 1)
-    with pytest.raises(TsbenchError, match=r"steps used, where the budget paper has 5,000,000"):
-        check(run)
 
 
 @pytest.mark.parametrize("rollout", ["true", "x", "[1]", "-5", "1e3", "null"])
@@ -189,3 +183,49 @@ def test_a_rollout_that_is_no_count_allows_nothing(run: RunDirectory, rollout: s
     spent(run, 10**6)
     with pytest.raises(TsbenchError):
         check(run)
+
+
+@pytest.mark.parametrize(
+    ("words", "budgets", "processes", "most"),
+    [
+        # A kind without settings has the defaults, 512 * 24; the others have 4,096 or fewer.
+        ("budget=paper method=monolithic", [2_000_000], 1, 2_000_000 + 512 * 24),
+        ("budget=paper method=monolithic", [2_000_000], 3, 2_000_000 + 3 * 512 * 24),
+        (
+            "budget=paper method=monolithic task.training.task.repeat=8",
+            [2 * 10**6],
+            1,
+            2 * 10**6 + 32 * 128 * 8,
+        ),
+        # Fine-tuning has the environments of the imitation, 32, and its repeated actions, 4.
+        (
+            "budget=paper method=prm task.training.finetune.rollout=100",
+            [10**6],
+            1,
+            2 * 10**6 + 32 * 100 * 4,
+        ),
+        # The smoke budget has 16 environments: 16 * 32 * 4 of the imitation are most.
+        ("method=twostage budget=smoke", [4096, 8192], 1, 12_288 + 2 * 16 * 32 * 4),
+        # No stage doubles its budget, however large an iteration may be that it may not even have.
+        ("budget=paper method=prm", [999_900, 100], 1, 2_000_000 + 512 * 24 + 100),
+        (
+            "budget=paper method=monolithic task.training.plan.rollout=1000000000",
+            [2 * 10**6],
+            1,
+            4 * 10**6,
+        ),
+    ],
+)
+def test_what_a_budget_allows(words: str, budgets: list[int], processes: int, most: int) -> None:
+    chosen = config.compose(["task=rocket_navigation", *words.split()])
+
+    def stages(steps: int) -> list[Stage]:
+        first = [Stage(f"stage{i}", budget) for i, budget in enumerate(budgets[1:])]
+        return [*first, Stage("last", budgets[0], steps=steps)]
+
+    assert overspent(stages(most), chosen, processes) == ""
+    assert f"{most + 1:,} steps used, where the budget" in overspent(
+        stages(most + 1), chosen, processes
+    )
+    more = [*stages(0), Stage("another", 2_000_001)]
+    assert overspent(more, chosen, processes).startswith("stages of ")

@@ -64,13 +64,25 @@ def check(run: RunDirectory, record: Record, task: Task[Any]) -> None:
     for path, found in faults:
         for fault in found:
             raise TsbenchError(f"{path}: {fault}")
-    if settings is not None:
-        processes = (versions or {}).get("processes", 1)
-        if more := overspent(record.stages, run.config(), processes):
-            raise TsbenchError(f"{run.score_file}: {more}")
+    check_budget(run, record)
     for path, content, written in _written(run, settings):
         if content != written:
             raise TsbenchError(f"{path} is not written as tsbench writes it")
+
+
+def check_budget(run: RunDirectory, record: Record) -> None:
+    """Checks that a training has kept to its budget, as far as its files say.
+
+    Raises:
+        TsbenchError: its stages go beyond it.
+    """
+    if not run.config_file.exists():
+        return
+    versions = run.versions() if run.versions_file.exists() else {}
+    processes = versions.get("processes", 1)
+    together = processes if _FORMS["processes"](processes) else 1
+    if more := overspent(record.stages, run.config(), together):
+        raise TsbenchError(f"{run.score_file}: {more}")
 
 
 def _written(run: RunDirectory, settings: Any) -> Iterator[tuple[Path, bytes, bytes]]:

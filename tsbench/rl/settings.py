@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from tsbench.core.policy import ACTIVATIONS, ENCODINGS
 
 UPDATES = ("auto", "numpy", "rsl_rl")  # `make_update` in rl/update.py resolves `auto`
 OPTIMIZERS = ("adam", "adamw", "rmsprop", "sgd")  # rsl-rl's
+
+# Stages that may follow `imitate`, in this order. They go on with its policy, and their settings
+# are changes to its settings.
+AFTER_IMITATION = ("settle", "finetune")
 
 
 @dataclass(frozen=True)
@@ -124,3 +130,24 @@ class PPOSettings:
         only = {"optimizer": "adam", "minibatch_advantages": False}
         given = {name: getattr(self, name) for name in only}
         return [f"{name}: {value}" for name, value in given.items() if value != only[name]]
+
+
+def iteration_steps(
+    training: Mapping[str, Mapping[str, Any]], kind: str, environments: int | None
+) -> int:
+    """`PPOSettings.steps` of a kind of stage, of settings that need not be valid.
+
+    Args:
+        training: changes to the settings of each kind.
+        kind: of stage; the defaults hold for one without changes.
+        environments: at most.
+    """
+    given = {**training.get("imitate", {})} if kind in AFTER_IMITATION else {}
+    given |= training.get(kind, {})
+    sizes = {}
+    for name in ("environments", "rollout", "repeat"):
+        size = given.get(name, getattr(PPOSettings, name))
+        sizes[name] = max(size, 1) if isinstance(size, int) else 1
+    if environments is not None:
+        sizes["environments"] = min(sizes["environments"], environments)
+    return math.prod(sizes.values())

@@ -18,6 +18,7 @@ from tsbench.core.typed import typed_items
 from tsbench.rl import processes
 from tsbench.rl.devices import CPU, torch_device, working_on
 from tsbench.rl.ppo import Learner, Report
+from tsbench.rl.settings import AFTER_IMITATION as AFTER_IMITATION  # methods use it too
 from tsbench.rl.settings import PPOSettings
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.device import DeviceDynamics, DeviceEnvironment, DeviceKinematics
@@ -27,8 +28,6 @@ from tsbench.sim.physics import Physics
 from tsbench.sim.tracking import Imitation
 
 Environment = BatchedEnvironment[Any] | DeviceEnvironment[Any]
-
-AFTER_IMITATION = ("settle", "finetune")  # stages that may follow `imitate`, in this order
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,7 +27,7 @@ from tsbench.core.task import Task, plannable
 from tsbench.core.typed import typed
 from tsbench.core.words import command
 from tsbench.evaluation.score import Score
-from tsbench.rl.settings import PPOSettings
+from tsbench.rl.settings import iteration_steps
 from tsbench.runs.schema import RunConfig
 
 M = TypeVar("M", Plan, ReferenceMotion)
@@ -82,39 +81,30 @@ class Stage:
 def overspent(stages: Sequence[Stage], config: RunConfig, processes: int = 1) -> str:
     """By how much the stages go beyond the run's budget, in words, or "" if they do not.
 
-    A stage may finish the iteration in which its budget ends: the actions of all its environments
-    between two updates. The largest iteration of the configuration is allowed to each stage, since
-    a method's stages need not bear the names of their settings.
+    A stage may finish the iteration in which its budget ends, if it does not double its budget by
+    that. The largest iteration of the configuration counts, since a method's stages need not bear
+    the names of their settings.
 
     Args:
         stages: what they used.
         config: of the run.
         processes: that trained together, each with the environments of the configuration.
     """
-    allowed = config.task.budgets[config.budget]
-    most, name = allowed.plan + allowed.act, f"the budget {config.budget}"
+    budget, name = config.task.budgets[config.budget], f"the budget {config.budget}"
+    allowed = budget.plan + budget.act
     planned = sum(stage.budget for stage in stages)
-    if planned > most:
-        return f"stages of {planned:,} steps, where {name} has {most:,}"
-    used = sum(stage.steps for stage in stages)
-    together = allowed.environments
-    kinds = ({}, *config.task.training.values())
-    iteration = processes * max(_iteration(each, together) for each in kinds)
-    if used > most + len(stages) * iteration:
-        rest = f"and lets a stage finish an iteration of {iteration:,}"
-        return f"{used:,} steps used, where {name} has {most:,} {rest}"
-    return ""
-
-
-def _iteration(training: Mapping[str, Any], environments: int | None) -> int:
-    """Environment steps between two updates by these changes to the settings of a stage, with so
-    many environments at most."""
-    most = {"environments": environments}
-    return math.prod(
-        min(size, most.get(name) or size) if isinstance(size, int) else 1
-        for name in ("environments", "rollout", "repeat")
-        if (size := training.get(name, getattr(PPOSettings, name)))
+    if planned > allowed:
+        return f"stages of {planned:,} steps, where {name} has {allowed:,}"
+    training = config.task.training
+    iteration = processes * max(
+        iteration_steps(training, kind, budget.environments) for kind in ("", *training)
     )
+    spare = sum(min(iteration, stage.budget) for stage in stages)
+    used = sum(stage.steps for stage in stages)
+    if used > allowed + spare:
+        rest = f"and lets the stages finish iterations of {iteration:,}"
+        return f"{used:,} steps used, where {name} has {allowed:,} {rest}"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -291,7 +281,7 @@ class RunDirectory:
         """The policy. A directory with only the policy's two files suffices."""
         if not self.path.is_dir():
             raise TsbenchError(f"no run directory {self.path}")
-        if self.unfinished and not self.policy_info_file.exists():
+        if not self.policy_info_file.exists() and self.unfinished:
             raise TsbenchError(self.unfinished)
         return Policy.load(self.path)
 
