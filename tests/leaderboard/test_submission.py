@@ -503,6 +503,9 @@ def test_what_a_run_says_itself_is_not_told_again(
 ) -> None:
     assert submit("one", *words) == 2
     assert "one is a run of tsbench, which says its own seed" in capsys.readouterr().err
+    bare("metrics.jsonl")(finished)  # with a score, but no configuration
+    assert submit("one", *words) == 2
+    assert "one is a run of tsbench, which says its own seed" in capsys.readouterr().err
     assert not Path("board").exists()
 
 

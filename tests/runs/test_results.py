@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 from collections.abc import Callable
@@ -144,6 +145,38 @@ def test_the_command_says_what_it_has_added_and_replaced(
     assert "out: 1 added, 0 replaced, 1 in all" in capsys.readouterr().out
     assert cli.main([*words, str(tmp_path / "1")]) == 0
     assert "out: 1 added, 1 replaced, 2 in all" in capsys.readouterr().out
+
+
+def test_curves_whose_rows_are_lost_stay(
+    tmp_path: Path, invented_record: Callable[[str], Record]
+) -> None:
+    out = tmp_path / "out"
+    for seed in range(3):
+        run = begin(tmp_path / str(seed), [*ROCKET, f"seed={seed}"])
+        finish(run, invented_record("rocket_navigation"))
+    before = results.collect(results.read([tmp_path / "0", tmp_path / "1"]), out).curves
+    (out / results.ROWS).unlink()
+    for seed in (2, 1):
+        results.collect(results.read([tmp_path / str(seed)]), out)
+    found = results.load(out)
+    assert len(found.rows) == 2
+    assert before.keys() < found.curves.keys()
+    assert len(found.curves) == 3
+
+
+def test_damaged_curves_are_one_line(
+    tmp_path: Path, invented_record: Callable[[str], Record]
+) -> None:
+    run, curves = begin(tmp_path / "run", ROCKET), tmp_path / "out" / results.CURVES
+    finish(run, invented_record("rocket_navigation"))
+    results.collect(results.read([run.path]), curves.parent)
+    content = curves.read_bytes()
+    for place in range(0, len(content), 7):
+        spoilt = bytearray(content)
+        spoilt[place : place + 40] = bytes(byte ^ 0xFF for byte in spoilt[place : place + 40])
+        curves.write_bytes(spoilt)
+        with contextlib.suppress(TsbenchError):
+            results.load(curves.parent)
 
 
 @pytest.mark.parametrize("arrays", [{"loss": np.zeros(3)}, {"a b": np.zeros((3, 4))}])

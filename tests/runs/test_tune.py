@@ -387,7 +387,7 @@ def test_the_command_goes_on_after_a_kill(tmp_path: Path) -> None:
         cwd=tmp_path, env=environment, capture_output=True, text=True,
     )  # fmt: skip
     assert again.stdout == f"{line}\n"
-    assert again.stderr.startswith("trial 0 of 1 is the best, worth ")
+    assert again.stderr.startswith("trial 0 is the best of 1 trial, worth ")
     other = command(tmp_path, "task.budgets.smoke.act=256", "--best")
     refused = subprocess.run(other, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert refused.returncode == 2

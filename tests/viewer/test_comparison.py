@@ -80,13 +80,15 @@ def test_scores_that_differ_in_kind_are_not_compared(made: Callable[..., Results
     change("smoke", protocol=SMOKE)
     (row,) = (row for row in found.rows.values() if row.method == "failed")
     found.rows[row.words] = replace(row, score=None, failure="no way")
+    longer = (*row.words, "task.constants.distance=40")
+    found.rows[longer] = replace(row, words=longer, score=None, failure="no way")
     names = comparison.names(found)
     assert {names[words] for words in found.rows} == {
-        "prm", "far, distance=80", "smoke, protocol smoke", "failed"
+        "prm", "far, distance=80", "smoke, protocol smoke", "failed", "failed, distance=40"
     }  # fmt: skip
     assert comparison.incomparable(found)
     assert {frozenset((pair.first, pair.second)) for pair in comparison.pairs(found)} == {
-        frozenset((name, "failed")) for name in ("prm", "far, distance=80", "smoke, protocol smoke")
+        frozenset((name, "failed")) for name in ("prm", "smoke, protocol smoke")
     }
 
 

@@ -21,7 +21,7 @@ from tsbench.core.files import read_file, write_whole
 
 # Exceptions that numpy and zipfile raise for damaged files. RuntimeError covers encrypted members
 # and unknown compression methods.
-_DAMAGE = (
+DAMAGE = (
     OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, MemoryError, OverflowError,
     zlib.error, zipfile.BadZipFile, struct.error, SyntaxError,
 )  # fmt: skip
@@ -148,7 +148,7 @@ def _content(path: Path, kind: str) -> dict[str, np.ndarray]:
                     raise ValueError(f"{quoted(name)}: {error}") from None
         if len(content) < len(members):
             raise ValueError("an array is there twice")
-    except _DAMAGE as error:
+    except DAMAGE as error:
         reason = str(error) or type(error).__name__
         raise TsbenchError(f"damaged {kind} file {path}: {reason}") from None
     return content

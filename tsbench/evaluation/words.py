@@ -24,7 +24,7 @@ def verdict(summary: Summary) -> str:
 
 
 def unranked(score: Score, *, standard: bool) -> str:
-    """Why a score is not ranked; "" for one that can be.
+    """Why a score is never ranked, however its policy was trained; "" for another.
 
     Args:
         score: of a policy.

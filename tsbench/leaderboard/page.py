@@ -100,9 +100,9 @@ ORACLE = (
 
 COLUMNS = (
     "solved_reward: the interquartile mean over an entry's trainings, from "
-    f"{RANKED_SEEDS} on with a 95 % interval; the other figures are their means. steps, time: of "
-    "one training. tuning trials: choices of settings that were tried before. seeds: trainings "
-    "that are kept."
+    f"{RANKED_SEEDS} on with a 95 % interval; the other figures are means over them. steps, "
+    "time: of one training. tuning trials: choices of settings that were tried before. seeds: "
+    "trainings that are kept."
 )
 
 

@@ -139,7 +139,7 @@ class Described:
         licence: of the files, such as MIT or CC-BY-4.0.
         url: where the method is described, or None.
         hardware: that trained it, or None.
-        tuning_trials: trainings whose results decided on the settings, or None if nobody knows.
+        tuning_trials: choices of settings that were tried before, or None if nobody knows.
         seeds_trained: the seeds of all trainings with these settings, kept or not.
     """
 
@@ -581,7 +581,8 @@ def pack(
         runs: directories, of runs or of exported policies.
         described: what the authors say; without `seeds_trained`, all seeds trained are the packed
             ones.
-        board: the folder in which the entry is made, in a new hidden folder.
+        board: that the entry is for. It is made in a new hidden folder there, or in the nearest
+            folder above a board that does not exist yet.
         protocol: of the scores.
         told: of trainings that tsbench did not make.
         score: makes the score of a policy that has none by the protocol.
@@ -599,7 +600,10 @@ def pack(
         there = next(one for one in (board, *board.absolute().parents) if os.path.lexists(one))
         if not there.is_dir():
             raise TsbenchError(f"{there} is no folder, so no board can be made there")
-        folder = Path(tempfile.mkdtemp(prefix=".submit-", dir=there))
+        try:
+            folder = Path(tempfile.mkdtemp(prefix=".submit-", dir=there))
+        except OSError as error:
+            raise TsbenchError(f"{there}: {error.strerror}") from None
     copies: dict[Path, Path] = {}
     try:
         with os_errors(folder):
@@ -706,6 +710,8 @@ def _pack_run(
             f"{run.path} has no {run.score_file.name}: of a policy that tsbench did not train "
             "say --seeds, --steps, --seconds and --command"
         )
+    if before is not None:
+        coherence.check_budget(copy, before)
     if before is not None and before.score.protocol == protocol.name and not rescore:
         if not copy.actions_file.exists():
             raise TsbenchError(

@@ -18,7 +18,6 @@ import io
 import json
 import shlex
 import shutil
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ import numpy as np
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import parse_json, read_file, write_whole
+from tsbench.core.motion import DAMAGE
 from tsbench.core.typed import typed
 from tsbench.core.words import command
 from tsbench.evaluation.score import Score
@@ -150,7 +150,7 @@ class Result:
 class Results:
     """Attributes:
     rows: by their words.
-    curves: of each stage in order, by the words of the run.
+    curves: of each stage in order, by the words of the run; perhaps of runs without a row.
     folders: where the policies are that are at hand, by the words of the run.
     """
 
@@ -312,9 +312,7 @@ def load(place: Path) -> Results:
         except (ValueError, OverflowError, TsbenchError) as error:
             raise TsbenchError(f"damaged results {rows}, line {number}: {error}") from None
         found.rows[result.words] = result
-    for words, curves in _load_curves(place / CURVES).items():
-        if words in found.rows:
-            found.curves[words] = curves
+    found.curves.update(_load_curves(place / CURVES))
     for result in found.rows.values():
         folder = place / POLICIES / _folder(result)
         if RunDirectory(folder).begun:
@@ -335,7 +333,7 @@ def _load_curves(path: Path) -> dict[tuple[str, ...], tuple[Curve, ...]]:
                     raise TsbenchError(f"{path} holds no learning curves of tsbench: {name!r}")
                 curve = Curve(stage, *file[name])
                 found[tuple(words)] = (*found.get(tuple(words), ()), curve)
-    except (OSError, ValueError, TypeError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise TsbenchError(f"damaged curves {path}: {error}") from None
     return found
 
@@ -355,11 +353,9 @@ def collect(new: Results, place: Path, trials: int | None = None) -> Results:
     Raises:
         TsbenchError: a file in the folder is damaged, or it cannot be written.
     """
-    if (place / ROWS).exists():
-        found = load(place)
-    else:  # the first collection, perhaps one that was killed: no file of others is replaced
-        found = Results()
-        _load_curves(place / CURVES)
+    # The curves are written first, so a collection that was killed may leave them alone.
+    begun = (place / ROWS).exists()
+    found = load(place) if begun else Results(curves=_load_curves(place / CURVES))
     for words, row in new.rows.items():
         before = found.rows.get(words, row).trials
         new.rows[words] = replace(row, trials=before if trials is None else trials)

@@ -316,8 +316,9 @@ def _claimed(study: Study, shared: optuna.Study, trials: int) -> Iterator[Trial 
             shared.sampler = _sampler(len(known))
             trial = shared.ask()
             held = _lock(study.place(trial.number) / "lock", wait=True)
-        if trial is not None and trial.number > 0:
-            # An unfinished one may have been stopped before it had chosen all.
+        if trial is not None and (trial.number > 0 or trial.params):
+            # An unfinished one may have been stopped before it had chosen all. Older studies have
+            # chosen settings in their first trial too.
             for key, dimension in study.space.items():
                 dimension.draw(trial, key)
     try:

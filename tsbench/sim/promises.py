@@ -7,6 +7,7 @@ would otherwise end in the middle of a computation, or give figures that mean no
 from __future__ import annotations
 
 import inspect
+import operator
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from tsbench.sim.kinematic import Planning
 from tsbench.sim.physics import Physics
 
 ROWS = 3  # states to try: another number than one, which numpy would stretch
-TOLERANCE = 1e-9  # of a reward above the largest one, for rounding
+TOLERANCE = 1e-6  # of a reward above the largest one, for rounding in float32
 
 
 def check_promises(name: str, task: Task[Any]) -> None:
@@ -97,7 +98,7 @@ class _Trial:
         task = self.task
         with self.explained("push_steps"):
             steps = tuple(task.push_steps)
-            within = all(0 <= step < task.horizon for step in steps)
+            within = all(operator.index(step) in range(task.horizon) for step in steps)
         if not (steps and within and list(steps) == sorted(set(steps))):
             needed = f"one or more rising steps from 0 to {task.horizon - 1}"
             raise self.broken(f"push_steps are {steps}, not {needed}")
@@ -147,12 +148,15 @@ class _Trial:
             seen = mdp.observation(following)
         about = f"observation{where} (observation_size {mdp.observation_size})"
         self.expect(about, seen, ROWS, mdp.observation_size)
+        with self.explained(f"max_reward{where}"):
+            most = float(mdp.max_reward)
+        if not 0.0 < most < np.inf:
+            raise self.broken(f"max_reward{where} is {most:g}, which normalises no reward")
         with self.explained(f"reward{where}"):
             reward = mdp.reward(state, action, following)
         self.expect(f"reward{where}", reward, ROWS)
-        if (found := float(np.max(reward))) > mdp.max_reward * (1.0 + TOLERANCE):
-            limit = f"its max_reward of {mdp.max_reward:g}"
-            raise self.broken(f"reward{where} is {found:g}, above {limit}")
+        if (found := float(np.max(reward))) > most * (1.0 + TOLERANCE):
+            raise self.broken(f"reward{where} is {found:g}, above its max_reward of {most:g}")
         for part in ("terminal", "reached", "violated"):
             with self.explained(part):
                 self.verdict(part, getattr(mdp, part)(following))

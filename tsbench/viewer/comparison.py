@@ -49,18 +49,23 @@ def names(results: Results) -> dict[tuple[str, ...], str]:
 
 
 def _name(group: Group) -> str:
-    constants = [word.removeprefix(CONSTANTS) for word in group.first.words if CONSTANTS in word]
     others = sorted({protocol for protocol, _, _ in _scored(group)} - {V1.name})
-    return ", ".join([group.label, *constants, *(f"protocol {other}" for other in others)])
+    more = [*_constants(group), *(f"protocol {other}" for other in others)]
+    return ", ".join([group.label, *more])
+
+
+def _constants(group: Group) -> list[str]:
+    """What was changed of the task, as words."""
+    return [word.removeprefix(CONSTANTS) for word in group.first.words if CONSTANTS in word]
 
 
 def pairs(results: Results) -> list[Pair]:
     """Every pair of groups of one task that can be compared: with scores by one protocol, of the
-    same task and constants. A run without a policy is worth zero by all of them."""
+    same task and constants. A run without a policy is worth zero by every protocol."""
     found = [
         (one, other, len(one.values(FIGURE).keys() & other.values(FIGURE).keys()))
         for one, other in _possible(results)
-        if len(_scored(one) | _scored(other)) < 2
+        if _comparable(one, other)
     ]
     differences = [difference(one, other, FIGURE) for one, other, _ in found]
     tested = {
@@ -79,7 +84,11 @@ def pairs(results: Results) -> list[Pair]:
 
 def incomparable(results: Results) -> bool:
     """Whether groups of one task are left out of `pairs` since their scores differ in kind."""
-    return any(len(_scored(one) | _scored(other)) > 1 for one, other in _possible(results))
+    return not all(_comparable(one, other) for one, other in _possible(results))
+
+
+def _comparable(one: Group, other: Group) -> bool:
+    return _constants(one) == _constants(other) and len(_scored(one) | _scored(other)) < 2
 
 
 def _possible(results: Results) -> Iterator[tuple[Group, Group]]:

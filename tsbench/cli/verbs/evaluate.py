@@ -71,8 +71,9 @@ def call(words: Sequence[str]) -> int:
             policy, task, protocol=protocol, threads=options.threads, progress=progress
         )
     label = options.policy
-    if path.is_dir() and path.name != places.path(label).name:
-        label = f"{label}, {path.name}"  # of an entry's trainings
+    place = places.path(label)
+    if path not in (place, place.parent) and path.name != place.name:  # an entry's first training
+        label = f"{label}, {path.name}"
     tables.show_score(console, f"{task.name}: {label}", score, task)
     tables.show_rank(console, standard, score)
     shown: dict[str, Any] = {**score.as_dict(), "standard": standard}

@@ -21,7 +21,7 @@ def call(words: Sequence[str]) -> int:
     flag("--licence", required=True, metavar="NAME", help="of the files, e.g. MIT")
     flag("--url", help="where the method is described")
     flag("--hardware", metavar="TEXT", help="that trained it")
-    flag("--tuning-trials", type=count, metavar="N", help="trainings that decided on settings")
+    flag("--tuning-trials", type=count, metavar="N", help="choices of settings tried before")
     flag("--trained", type=seeds, metavar="SEEDS", help="all that were trained, e.g. 0-9 (RUNs')")
     flag("--rescore", action="store_true", help="score again what has a score")
     flag("--check", action="store_true", help="run the whole verification and keep nothing")
@@ -40,6 +40,7 @@ def call(words: Sequence[str]) -> int:
     from tsbench.evaluation.evaluate import evaluate
     from tsbench.evaluation.protocol import V1
     from tsbench.leaderboard import submission, verify
+    from tsbench.runs.directory import RunDirectory
     from tsbench.runs.progress import progress_bar
 
     console = Console(stderr=True)
@@ -56,9 +57,9 @@ def call(words: Sequence[str]) -> int:
     except ValueError as error:
         raise TsbenchError(str(error)) from None
     foreign = (options.seeds, options.steps, options.seconds, options.command)
-    own = [run for run in options.runs if (run / "config.yaml").exists()]
+    own = [run for run in map(RunDirectory, options.runs) if run.begun or run.finished]
     if own and any(one is not None for one in (*foreign, options.code)):
-        parser.error(f"{own[0]} is a run of tsbench, which says its own seed, steps and command")
+        parser.error(f"{own[0].path} is a run of tsbench, which says its own seed and steps")
     if None not in foreign and len(options.seeds) != len(options.runs):
         parser.error(f"{len(options.seeds)} --seeds for {len(options.runs)} runs")
     given = (

@@ -62,8 +62,8 @@ def call(words: Sequence[str]) -> None:
         tune.tune(study, trials, told=lambda line: sys.stderr.write(f"{line}\n"))
     trial, spent = tune.best(study)
     chosen = study.chosen(trial.params)
+    best = f"trial {trial.number} is the best of {several(spent, 'trial')}"
+    sys.stderr.write(f"{best}, worth {trial.value:.4g}\n")
     sys.stdout.write(f"{command('run', *chosen)}\n")
-    worth = f"trial {trial.number} of {spent} is the best, worth {trial.value:.4g}"
-    sys.stderr.write(f"{worth} (mean solved_reward over {several(len(study.seeds), 'seed')})\n")
     figures = {"words": chosen, "value": trial.value, "trial": trial.number, "trials": spent}
     write_json(options.json, {**figures, "seeds": study.seeds})

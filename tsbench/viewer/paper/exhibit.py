@@ -167,8 +167,8 @@ def _main_budget(groups: Sequence[Sequence[Result]], one: Result) -> str:
 
 
 def _label(result: Result, *, whole: bool = False) -> str:
-    """The method with its options. Of the task's settings for it, and of all that were tuned, it
-    says that there are some, or `whole` which."""
+    """The method with its options. Settings of the task, and all settings of a tuned run, are
+    summed up as "other settings" or "tuned"; `whole` lists them."""
     shown = [word for word in result.options if not (result.trials or word.startswith("task."))]
     options = [word.removeprefix("method.") for word in shown]
     if others := [word for word in result.options if word not in shown]:

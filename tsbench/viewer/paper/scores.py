@@ -22,6 +22,7 @@ from tsbench.viewer.paper.exhibit import (
     interval,
     jitter,
     main_group,
+    papers_group,
     tidy,
 )
 
@@ -39,8 +40,8 @@ class Line:
         success: mean share of the perturbed starts solved.
         succeeding: seeds that solve at least `ENOUGH` of them.
         measures: means of the task's leading measures, over the seeds that have them.
-        against: `solved_reward` less that of the two-stage method with the same seeds, tuned as
-            much if there is such a group.
+        against: `solved_reward` less that of the two-stage method with the same seeds, and
+            with as many trials of tuning if there is such a group.
         p_value: of that, after Holm over the rows of the table that have an interval; None for
             the others.
     """
@@ -71,13 +72,15 @@ def table(groups: Sequence[Group], tasks: dict[str, Task]) -> list[Line]:
 
 
 def _ours(groups: Sequence[Group], group: Group) -> Group | None:
-    """The two-stage method's group that another one is held against: one that was tuned as much,
-    else the main one, which is held against none."""
-    main = main_group(groups, group.task, OURS)
-    if main is group:
+    """The two-stage method's group that another one is held against: the one with its default
+    settings, or with as many trials of tuning as the other, if there is one. The default group is
+    held against none, and the tuned ones against it."""
+    defaults = papers_group(groups, group.task, OURS) or main_group(groups, group.task, OURS)
+    if group is defaults:
         return None
-    alike = [one for one in groups if one.first.trials == group.first.trials and one is not group]
-    return main_group(alike, group.task, OURS) or main
+    alike = [one for one in groups if one.first.trials == group.first.trials > 0]
+    tuned = main_group(alike, group.task, OURS)
+    return tuned if tuned and group.method != OURS else defaults
 
 
 def _line(
