@@ -112,13 +112,12 @@ def _exhibit(
             tidy(panel)
             panel.set(ylabel="normalized return", xlim=(0.0, None))
         panels[-1].set_xlabel(axis.label)
-        scored = "finished policy, on the task's reward"
         legend(
             figure, groups,
             [
                 Line2D([], [], color="grey", ls=PLANNING, label="planning stage"),
                 Line2D([], [], color="grey", label="stage in physics"),
-                Line2D([], [], color="grey", ls="", marker="o", label=scored),
+                Line2D([], [], color="grey", ls="", marker="o", label="finished policy"),
             ],
         )  # fmt: skip
     return Exhibit(
