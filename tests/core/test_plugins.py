@@ -292,19 +292,20 @@ def test_a_broken_method_is_told_when_it_is_used(toy: Toy, tmp_path: Path) -> No
     assert done.returncode == 0, done.stderr
 
 
-def test_a_method_that_returns_no_policy(toy: Toy, tmp_path: Path) -> None:
-    (toy.folder / "lazy.py").write_text(METHOD.replace("    return replace", "    replace"))
+@pytest.mark.parametrize(
+    ("right", "wrong", "given"),
+    [
+        ("    return replace", "    replace", "NoneType, not a Policy"),
+        ('method="lazy"', 'method="twostage"', "a policy that names the method twostage"),
+    ],
+)
+def test_a_method_that_returns_something_else(
+    toy: Toy, tmp_path: Path, right: str, wrong: str, given: str
+) -> None:
+    (toy.folder / "lazy.py").write_text(METHOD.replace(right, wrong))
     done = call(tmp_path, *QUICK)
     assert done.returncode == 2
-    line = "tsbench: the method lazy returns NoneType, not a Policy"
-    assert done.stderr.splitlines()[-1].startswith(line)
-
-
-def test_a_policy_that_names_another_method(toy: Toy, tmp_path: Path) -> None:
-    (toy.folder / "lazy.py").write_text(METHOD.replace('method="lazy"', 'method="twostage"'))
-    done = call(tmp_path, *QUICK)
-    assert done.returncode == 2
-    line = "tsbench: the method lazy returns a policy that names the method twostage"
+    line = f"tsbench: the method lazy returns {given}"
     assert done.stderr.splitlines()[-1].startswith(line)
 
 

@@ -181,7 +181,7 @@ def test_a_rollout_that_is_no_count_allows_nothing(run: RunDirectory, rollout: s
     """It is another configuration than the one that versions.json names, which is told."""
     hashed(text("config.yaml", "rollout: 16", f"rollout: {rollout}"))(run)
     spent(run, 10**6)
-    with pytest.raises(TsbenchError):
+    with pytest.raises(TsbenchError, match="6,000,000 steps used, where the budget paper has"):
         check(run)
 
 

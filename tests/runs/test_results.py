@@ -185,7 +185,7 @@ def test_curves_that_somebody_else_keeps_are_not_replaced(
 ) -> None:
     run, curves = begin(tmp_path / "run", ROCKET), tmp_path / results.CURVES
     finish(run, invented_record("rocket_navigation"))
-    np.savez(curves, **arrays)  # type: ignore[arg-type]
+    np.savez(curves, allow_pickle=False, **arrays)
     content = curves.read_bytes()
     with pytest.raises(TsbenchError, match=r"curves\.npz holds no learning curves of tsbench"):
         results.collect(results.read([run.path]), tmp_path)

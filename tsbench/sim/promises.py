@@ -105,7 +105,7 @@ class _Trial:
         with self.explained("ideal"):
             frames = np.shape(task.ideal().time)
         if frames != (task.horizon + 1,):
-            needed = f"{task.horizon + 1}, one before and one after each step of the horizon"
+            needed = f"{task.horizon + 1}, one at the start and one after each step"
             raise self.broken(f"ideal has times of the shape {frames}; states needed: {needed}")
 
     def controls(
