@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,11 @@ from tsbench import cli, tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import Plan
 from tsbench.evaluation.protocol import V1
-from tsbench.runs.directory import Record, RunDirectory
+from tsbench.runs.directory import Record, RunDirectory, Stage
 from tsbench.viewer import curves, report
 
 MakeRun = Callable[..., Path]
+BOARD = Path(__file__).parents[2] / "leaderboards" / "v1"
 
 
 def words_of(text: str) -> str:
@@ -98,6 +100,18 @@ def test_why_a_score_is_not_ranked_is_said_first(
         words = report.worth_in_words(one, task)
         assert words.startswith(f"Not ranked: {reasons}. The policy solves")
     assert report.worth_in_words(replace(record, score=v1), task).startswith("The policy solves")
+
+
+def test_a_training_beyond_its_budget_is_said_first(make_run: MakeRun) -> None:
+    run = RunDirectory(make_run("rocket_navigation", 0.7))
+    kept = min((BOARD / "rocket_navigation").glob("twostage/*/config.yaml"))
+    run.config_file.write_text(kept.read_text())  # of 1,000,000 steps for each stage
+    content = json.loads(run.score_file.read_text())
+    for steps, said in ((1_000_000, False), (2_000_001, True)):
+        content["stages"] = [asdict(Stage("imitate", steps, steps=steps))]
+        run.score_file.write_text(json.dumps(content))
+        more = "Over the budget, so no leaderboard takes this run: stages of 2,000,001 steps, where"
+        assert (f"<p>{more} the budget paper has 2,000,000." in report.render(run)) == said
 
 
 @pytest.mark.parametrize(

@@ -23,11 +23,11 @@ from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.score import Score
 from tsbench.runs.directory import (
     MAX_CONFIG,
+    MAX_PROCESSES,
     MAX_SCORE,
     MAX_VERSIONS,
     Record,
     RunDirectory,
-    overspent,
 )
 from tsbench.runs.schema import ELSEWHERE, encode, identity_hash
 
@@ -76,12 +76,7 @@ def check_budget(run: RunDirectory, record: Record) -> None:
     Raises:
         TsbenchError: its stages go beyond it.
     """
-    if not run.config_file.exists():
-        return
-    versions = run.versions() if run.versions_file.exists() else {}
-    processes = versions.get("processes", 1)
-    together = processes if _FORMS["processes"](processes) else 1
-    if more := overspent(record.stages, run.config(), together):
+    if more := run.overspent(record):
         raise TsbenchError(f"{run.score_file}: {more}")
 
 
@@ -225,7 +220,7 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     ),
     "physics": _mapping(_is(_HASH)),
     "device": lambda value: _line(value) or _mapping(_line)(value),
-    "processes": lambda value: type(value) is int and 1 < value <= 10_000,
+    "processes": lambda value: type(value) is int and 1 < value <= MAX_PROCESSES,
     "platform": _line,
     "commit": lambda value: value is None or _is(_COMMIT)(value),
 }

@@ -45,6 +45,7 @@ MAX_SCORE = 512 * 2**10
 MAX_METRICS = 32 * 2**20
 MAX_CURVES = 2 * 2**20
 MAX_FAILURE = 16 * 2**10
+MAX_PROCESSES = 10_000  # that trained together
 
 # File names that `workspace` uses. `RunDirectory` has the paths of all files.
 METRICS = "metrics.jsonl"
@@ -266,6 +267,16 @@ class RunDirectory:
         if not isinstance(content, dict):
             raise TsbenchError(f"damaged versions {self.versions_file}: no key: value pairs")
         return content
+
+    def overspent(self, record: Record) -> str:
+        """By how much the training has gone beyond its budget, as far as its files say; see the
+        function `overspent`."""
+        if not self.begun:
+            return ""
+        versions = self.versions() if self.versions_file.exists() else {}
+        processes = versions.get("processes")  # kept of several alone
+        together = processes if type(processes) is int and 1 < processes <= MAX_PROCESSES else 1
+        return overspent(record.stages, self.config(), together)
 
     def record(self) -> Record:
         """The content of a finished run's `score.json`."""

@@ -95,7 +95,7 @@ def _pages(run: RunDirectory) -> tuple[str, str]:
             "title": html.escape(subject.title),
             "plan": page.css(PLAN_COLOUR),
             "executed": page.css(EXECUTED_COLOUR),
-            "answers": "".join(_answers(subject, recording, plan, audit)),
+            "answers": "".join(_answers(subject, run, recording, plan, audit)),
             "view": html.escape(view),
             "sections": "".join(_sections(subject, run, recording, plan, learning, audit)),
         },
@@ -112,7 +112,11 @@ def _audit(subject: Subject, run: RunDirectory) -> Audit | None:
 
 
 def _answers(
-    subject: Subject, recording: Recording, plan: Recording | None, audit: Audit | None
+    subject: Subject,
+    run: RunDirectory,
+    recording: Recording,
+    plan: Recording | None,
+    audit: Audit | None,
 ) -> Iterator[str]:
     assert subject.score is not None
     score = subject.score.score
@@ -121,10 +125,13 @@ def _answers(
         planned = planned_in_words(plan) + " A plan ignores physics."
     if audit is not None and not audit.passed:
         planned = f"{failures_in_words(audit)} {planned}"
+    worth = worth_in_words(subject.score, subject.task)
+    if more := run.overspent(subject.score):
+        worth = f"Over the budget, so no leaderboard takes this run: {more}. {worth}"
     for kind, title, text in (
         ("plan", "What was planned", planned),
         ("executed", "What was executed", executed_in_words(recording)),
-        ("score", "How good it is", worth_in_words(subject.score, subject.task)),
+        ("score", "How good it is", worth),
     ):
         leads = kind == "score"
         solved = f'<p class="verdict">{verdict(score.perturbed)}</p>' if leads else ""

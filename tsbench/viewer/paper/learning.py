@@ -75,7 +75,7 @@ AXES = (
 def exhibits(
     results: Results, groups: Sequence[Group], tasks: Mapping[str, Task]
 ) -> Iterator[Exhibit]:
-    """One for each of `AXES`, with a panel for each task that has curves."""
+    """One for each of `AXES`, with a panel for each task and budget that has curves."""
     with_curves = [
         group for group in groups if any(results.curves.get(row.words) for row in group.rows)
     ]
@@ -89,11 +89,11 @@ def exhibits(
 def _exhibit(
     axis: Axis, results: Results, groups: Sequence[Group], claims: Sequence[Claim]
 ) -> Exhibit:
-    tasks = by_task(groups)
+    parts = _by_budget(groups)
     data: list[tuple[object, ...]] = []
-    with drawing(0.7 + 2.3 * len(tasks)) as figure:
-        panels = figure.subplots(len(tasks), 1, squeeze=False)[:, 0]
-        for panel, (task, members) in zip(panels, tasks.items(), strict=True):
+    with drawing(0.7 + 2.3 * len(parts)) as figure:
+        panels = figure.subplots(len(parts), 1, squeeze=False)[:, 0]
+        for panel, (title, members) in zip(panels, parts.items(), strict=True):
             for group in members:
                 for dashes, xs, ys in _means(axis, results.curves, group.rows):
                     for x, y in zip(xs, ys, strict=True):
@@ -106,7 +106,7 @@ def _exhibit(
                         end, row.normalized_reward, "o", color=group.colour, ms=6, mec="white"
                     )
                     data += _rows(axis, results.curves.get(row.words, ()), group.label, row)
-            panel.set_title(task, loc="left")
+            panel.set_title(title, loc="left")
             panel.set_ylim(bottom=min(0.0, panel.get_ylim()[0]))
             panel.xaxis.set_major_formatter(EngFormatter(sep=""))
             tidy(panel)
@@ -135,6 +135,18 @@ def _exhibit(
         columns=("task", "method", "seed", "stage", axis.name, "normalized_return"),
         rows=data,
     )
+
+
+def _by_budget(groups: Sequence[Group]) -> Mapping[str, list[Group]]:
+    """The groups of each panel, by its title: of a task, and of each of its budgets where it has
+    several. On one axis a larger budget would leave the others a corner."""
+    found: dict[str, list[Group]] = {}
+    for task, members in by_task(groups).items():
+        budgets = {group.first.budget for group in members}
+        for group in sorted(members, key=lambda group: group.first.budget):
+            title = task if len(budgets) == 1 else f"{task}, budget {group.first.budget}"
+            found.setdefault(title, []).append(group)
+    return found
 
 
 def points(
