@@ -14,7 +14,6 @@ counts as zero.
 from __future__ import annotations
 
 import argparse
-import fcntl
 import os
 import shlex
 import shutil
@@ -31,12 +30,13 @@ from typing import IO, NoReturn
 
 from tsbench.cli.launch import placed
 from tsbench.core.errors import Stopped, TsbenchError, os_errors
+from tsbench.core.files import lock
 from tsbench.core.words import duration
 from tsbench.runs import config, results
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.execute import complete, prepare
 from tsbench.runs.provenance import check_provenance
-from tsbench.runs.schema import RunConfig
+from tsbench.runs.schema import RunConfig, words_of
 
 TRIALS = "trials="
 WORK = "--work"  # what a process of this file is given that trains
@@ -60,7 +60,7 @@ class Job:
 
     @property
     def words(self) -> tuple[str, ...]:
-        return results.words_of(self.chosen, self.given)
+        return words_of(self.chosen, self.given)
 
     @property
     def run(self) -> RunDirectory:
@@ -211,14 +211,10 @@ class Study:
 
 def _busy(directory: Path) -> bool:
     """Whether a process has the run, such as one that a killed study has left behind."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
+    descriptor = lock(directory, wait=False)
+    if descriptor is not None:
         os.close(descriptor)
-    return False
+    return descriptor is None
 
 
 def train(given: Sequence[str]) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,12 +15,13 @@ import pytest
 
 from tsbench import cli
 from tsbench.core.errors import TsbenchError
-from tsbench.core.files import write_json
+from tsbench.core.files import lock, write_json, write_whole
 from tsbench.runs import config, provenance, results
 from tsbench.runs.directory import POINTS, Record, RunDirectory
 from tsbench.runs.execute import prepare
 from tsbench.runs.provenance import write_provenance
 from tsbench.runs.results import Result, Results
+from tsbench.runs.schema import words_of
 
 ROCKET = ["task=rocket_navigation", "budget=smoke"]
 
@@ -61,7 +63,7 @@ def only(found: Results | None) -> Result:
 
 def test_a_run_is_named_by_the_words_that_decide_its_result() -> None:
     given = ["seed=3", "threads=2", "++task.constants.distance=24", "task=rocket_navigation"]
-    found = results.words_of(config.compose(given), given)
+    found = words_of(config.compose(given), given)
     assert found == (
         "task=rocket_navigation", "method=twostage", "budget=fast", "seed=3",
         "task.constants.distance=24",
@@ -110,6 +112,39 @@ def test_a_plan_that_fails_is_a_result_of_zero(tmp_path: Path) -> None:
     row = only(results.of_run(run))
     assert row.failure == "the plan fails its audit"
     assert (row.solved_reward, row.normalized_reward, row.success, row.steps) == (0, 0, 0, 50)
+
+
+def test_a_failed_run_has_used_the_steps_of_stages_without_curves_too(tmp_path: Path) -> None:
+    run = begin(tmp_path / "run", ROCKET)
+    with run.metrics_file.open("a") as file:
+        for steps in (20, 16_777_217):  # more than a float of 32 bits can count
+            file.write(json.dumps({"stage": "roadmap", "steps": steps, "seconds": 7.5}) + "\n")
+    run.failure_file.write_text("no way\n")
+    stages = only(results.of_run(run)).stages
+    assert [(one.name, one.steps, one.seconds) for one in stages] == [
+        ("plan", 50, 5.0),
+        ("roadmap", 16_777_217, 7.5),
+    ]
+
+
+def test_no_two_processes_change_a_results_folder_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, invented_record: Callable[[str], Record]
+) -> None:
+    run = begin(tmp_path / "run", ROCKET)
+    finish(run, invented_record("rocket_navigation"))
+    place, free = tmp_path / "results", []
+    write = write_whole
+
+    def noted(path: Path, content: bytes) -> None:
+        free.append(lock(place, wait=False))
+        write(path, content)
+
+    monkeypatch.setattr(results, "write_whole", noted)
+    results.collect(results.read([run.path]), place)
+    assert free == [None, None]
+    descriptor = lock(place, wait=False)
+    assert descriptor is not None
+    os.close(descriptor)
 
 
 def test_results_are_read_as_they_were_kept_and_merged_by_their_words(
@@ -240,7 +275,7 @@ def test_the_policies_of_the_best_the_median_and_the_worst_seed_stay(
 def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TsbenchError, match="there is no directory"):
         results.read([tmp_path / "nowhere"])
-    with pytest.raises(TsbenchError, match="holds no finished run, no entry and no results"):
+    with pytest.raises(TsbenchError, match="no finished run, no entry and no results of tsbench"):
         results.read([tmp_path])
     (tmp_path / results.ROWS).write_text('{"task": 3}\n')
     with pytest.raises(TsbenchError, match=r"damaged results .*runs\.jsonl, line 1: task must be"):

@@ -28,7 +28,7 @@ from tsbench.rl.ppo import Learner
 from tsbench.rl.settings import PPOSettings
 from tsbench.runs import config, execute
 from tsbench.runs.checkpoint import Checkpoints, decode, encode
-from tsbench.runs.directory import RunDirectory
+from tsbench.runs.directory import MOST_STAGES, RunDirectory
 from tsbench.runs.workspace import RunMonitor, RunWorkspace
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
@@ -500,6 +500,22 @@ def test_a_signal_saves_the_iteration_and_says_how_to_go_on(
     assert {path.name for path in (tmp_path / "run").iterdir()} >= PAGES
 
 
+def test_a_signal_before_the_first_iteration_ends_says_how_to_go_on_too(
+    uninterrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as changed:
+        changed.setattr(
+            BatchedEnvironment, "step", lambda self, action: os.kill(os.getpid(), signal.SIGINT)
+        )
+        assert cli.main(["run", *WORDS, "directory=run"]) == 130
+    line = "tsbench: interrupted; to go on: tsbench run resume=run\n"
+    assert capsys.readouterr().err == line
+    assert cli.main(["run", "resume=run"]) == 0
+    assert result(tmp_path / "run") == result(uninterrupted)
+
+
 def test_a_second_signal_does_not_wait(tmp_path: Path) -> None:
     workspace = RunWorkspace(tmp_path, Console(file=io.StringIO()))
     with workspace.stage("plan", 100) as monitor:
@@ -551,6 +567,40 @@ def test_a_stage_without_snapshots_is_done_again(tmp_path: Path) -> None:
     assert method(workspace, "") == [0, 20, 0, 10]
     workspace.close()
     assert rows() == everything
+
+
+def test_a_stage_that_ends_below_its_budget_is_recorded_once(tmp_path: Path) -> None:
+    def method(workspace: RunWorkspace, last: int) -> None:
+        with workspace.stage("roadmap", 20) as monitor:
+            monitor.update(6, {})
+        with workspace.stage("train", 20) as monitor:
+            for steps in range(10, last + 1, 10):
+                monitor.update(steps, {}, {"steps": steps}.copy)
+
+    for last in (10, 20):
+        workspace = RunWorkspace(tmp_path, Console(file=io.StringIO()), interval=0.0)
+        method(workspace, last)
+        workspace.close()
+    rows = map(json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines())
+    stages = [row["stage"] for row in rows]
+    assert stages.count("roadmap") == 1
+    assert [(stage.name, stage.steps) for stage in workspace.stages] == [
+        ("roadmap", 6),
+        ("train", 20),
+    ]
+
+
+def test_a_stage_whose_checkpoints_would_be_lost_is_refused(tmp_path: Path) -> None:
+    workspace = RunWorkspace(tmp_path, Console(file=io.StringIO()))
+    for name in ("fine-tune", "", "a/b"):
+        with pytest.raises(TsbenchError, match="a stage has a name of letters, digits and _"):
+            workspace.stage(name, 10).__enter__()
+    for number in range(MOST_STAGES):
+        with workspace.stage(f"stage{number}", 10):
+            pass
+    with pytest.raises(TsbenchError, match=f"a run has at most {MOST_STAGES} stages"):
+        workspace.stage("another", 10).__enter__()
+    workspace.close()
 
 
 def test_the_policy_can_be_read_back(uninterrupted: Path) -> None:

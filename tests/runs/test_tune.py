@@ -115,12 +115,27 @@ def test_all_trials_train_with_the_same_seeds(tmp_path: Path, scored: Any) -> No
 
     def noted(made: RunConfig, words: Sequence[str]) -> None:
         seen.append((Path(made.directory or "").parent.name, made.seed))
+        # The words that the run keeps as its command.
+        assert config.compose(list(words)).identity == made.identity
         run(made, words)
 
     tune.tune(given, 2, run=noted)
     seeds = [tune.FIRST_SEED + i for i in range(3)]
     assert seen == [(f"trial{trial}", seed) for trial in range(2) for seed in seeds]
     assert set(seeds).isdisjoint(range(1000))
+
+
+def test_a_study_goes_on_in_other_words_that_say_the_same(tmp_path: Path, scored: Any) -> None:
+    tune.tune(study(tmp_path), 1, run=scored(lambda entropy: 0.0))
+    words = ("task.training.task.clip=0.2", *WORDS)
+    same = (*reversed(WORDS), "checkpoint=10", "loggers=[]", "threads=1")
+    first = tune.prepare(list(WORDS), tmp_path / "study")
+    other = tune.prepare(list(same), tmp_path / "study")
+    assert tune._plain(first.words) == tune._plain(other.words) != tune._plain(words)
+    given = study(tmp_path)
+    assert len(trials(replace(given, words=same))) == 1
+    with pytest.raises(TsbenchError, match=r"without task\.training\.task\.clip=0\.2\)"):
+        trials(replace(given, words=words))
 
 
 def test_unpromising_trials_end_after_the_first_seed(tmp_path: Path, scored: Any) -> None:

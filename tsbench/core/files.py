@@ -3,6 +3,7 @@ replace an existing file."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -11,7 +12,7 @@ import secrets
 import stat
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -274,3 +275,35 @@ def encode_json(content: Any) -> bytes:
     """The bytes of a JSON file that `write_json` writes: every list of plain values on one line."""
     text = json.dumps(content, indent=2)
     return (re.sub(r"\[[^][{}\"]*\]", lambda one: " ".join(one[0].split()), text) + "\n").encode()
+
+
+def lock(path: Path, *, wait: bool) -> int | None:
+    """Locks a folder, or a file, which is made if need be, against other processes. The kernel
+    releases the lock when its holder ends, however it ends.
+
+    Returns:
+        The descriptor that holds the lock, to be closed; None if another process has the lock and
+        `wait` is false.
+    """
+    if path.is_dir():
+        descriptor = os.open(path, os.O_RDONLY)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Has the `lock` of a folder or file, for which it waits."""
+    descriptor = lock(path, wait=True)
+    assert descriptor is not None
+    try:
+        yield
+    finally:
+        os.close(descriptor)

@@ -34,7 +34,7 @@ M = TypeVar("M", Plan, ReferenceMotion)
 
 # Learning curves as an entry keeps them: `metrics.jsonl` with fewer rows and figures.
 POINTS = 200  # of a stage
-MOST_STAGES = 16
+MOST_STAGES = 16  # of a run
 LARGEST = 1e15  # figures that can be drawn without an overflow
 RETURNS = ("episode_return", "normalized_return")
 

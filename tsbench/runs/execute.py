@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import json
@@ -28,7 +27,7 @@ from tsbench.core.errors import (
     memory_errors,
     os_errors,
 )
-from tsbench.core.files import leftovers, taken, write_json, write_whole
+from tsbench.core.files import leftovers, lock, taken, write_json, write_whole
 from tsbench.core.method import Problem
 from tsbench.core.policy import Policy
 from tsbench.core.typed import unknown_key
@@ -196,19 +195,16 @@ def _work(
 
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """Locks the directory against other processes. The system releases the lock when the process
-    ends, however it ends.
+    """Has the lock of the run directory.
 
     Raises:
         TsbenchError: another process has the lock.
     """
     with os_errors(directory):
-        descriptor = os.open(directory, os.O_RDONLY)
+        descriptor = lock(directory, wait=False)
+    if descriptor is None:
+        raise TsbenchError(f"another process is at work in {directory}")
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise TsbenchError(f"another process is at work in {directory}") from None
         yield
     finally:
         os.close(descriptor)
@@ -245,9 +241,9 @@ def _explained(run: RunDirectory) -> Iterator[None]:
         place = f"; the plan is in {run.path}" if run.plan_file.exists() else ""
         raise PlanError(f"{error}{place}") from error
     except TsbenchError as error:
-        raise TsbenchError(f"{error}{_way_on(run)}") from error
+        raise TsbenchError(f"{error}{_way_on(run) if run.trained else ''}") from error
     except Stopped as stopped:
-        raise Stopped(stopped.signal, f"{stopped}{_way_on(run)}") from None
+        raise Stopped(stopped.signal, f"{stopped}{_way_on(run) if run.begun else ''}") from None
 
 
 def _dumped(path: Path, error: NotFiniteError) -> str:
@@ -260,7 +256,7 @@ def _dumped(path: Path, error: NotFiniteError) -> str:
 
 
 def _way_on(run: RunDirectory) -> str:
-    return f"; to go on: {command('run', f'resume={run.path}')}" if run.trained else ""
+    return f"; to go on: {command('run', f'resume={run.path}')}"
 
 
 def _train(

@@ -18,7 +18,7 @@ import io
 import json
 import shlex
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ import numpy as np
 
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
-from tsbench.core.files import parse_json, read_file, write_whole
+from tsbench.core.files import locked, parse_json, read_file, write_whole
 from tsbench.core.motion import DAMAGE
 from tsbench.core.typed import typed
 from tsbench.core.words import command
@@ -39,7 +39,7 @@ from tsbench.runs.directory import (
     standard_name,
     thin,
 )
-from tsbench.runs.schema import ELSEWHERE, RunConfig
+from tsbench.runs.schema import words_of
 
 ROWS = "runs.jsonl"
 CURVES = "curves.npz"
@@ -175,21 +175,6 @@ class Results:
         return list(found.values())
 
 
-def words_of(config: RunConfig, given: Iterable[str]) -> tuple[str, ...]:
-    """The words of a run in one order, with the defaults of task, method, budget and seed, and
-    without those that change no result."""
-    said = {
-        "task": config.task.name,
-        "method": config.method["name"],
-        "budget": config.budget,
-        "seed": config.seed,
-    }
-    plain = {word.lstrip("+~") for word in given}
-    others = {word for word in plain if word.partition("=")[0] not in (*said, *ELSEWHERE)}
-    others = {word for word in others if not word.startswith(("hydra.", "hydra/"))}
-    return (*(f"{key}={value}" for key, value in said.items()), *sorted(others))
-
-
 def read(paths: Sequence[Path]) -> Results:
     """The results in run directories, entries and results folders, and in all folders below the
     given ones. Of results with the same words the last one counts.
@@ -203,7 +188,10 @@ def read(paths: Sequence[Path]) -> Results:
             raise TsbenchError(f"there is no directory {path}")
         parts = list(_parts(path))
         if not parts:
-            raise TsbenchError(f"{path} holds no finished run, no entry and no results")
+            raise TsbenchError(
+                f"{path} holds no finished run, no entry and no results of tsbench (an entry of "
+                "another library has no config.yaml)"
+            )
         for part in parts:
             found.update(part)
     return found
@@ -267,11 +255,16 @@ def _words(line: str) -> list[str]:
 
 
 def _stages(run: RunDirectory) -> tuple[Stage, ...]:
-    """What the stages of a run without a score have used, by its metrics."""
-    ends = [
-        (c.stage, int(c.steps[-1]), float(c.seconds[-1])) for c in read_curves(run.metrics_file)
-    ]
-    return tuple(Stage(name, steps, steps=steps, seconds=seconds) for name, steps, seconds in ends)
+    """What the stages of a run without a score have used, by the last line of each in its metrics,
+    which tell neither their budgets nor their physics steps."""
+    found: dict[str, Stage] = {}
+    for row in read_metrics(run.metrics_file) if run.metrics_file.exists() else ():
+        try:
+            name, steps, seconds = str(row["stage"]), int(row["steps"]), float(row["seconds"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise TsbenchError(f"damaged metrics {run.metrics_file}: {error}") from None
+        found[name] = Stage(name, steps, steps=steps, seconds=seconds)
+    return tuple(found.values())
 
 
 def read_curves(metrics: Path) -> tuple[Curve, ...]:
@@ -353,15 +346,16 @@ def collect(new: Results, place: Path, trials: int | None = None) -> Results:
     Raises:
         TsbenchError: a file in the folder is damaged, or it cannot be written.
     """
-    # The curves are written first, so a collection that was killed may leave them alone.
-    begun = (place / ROWS).exists()
-    found = load(place) if begun else Results(curves=_load_curves(place / CURVES))
-    for words, row in new.rows.items():
-        before = found.rows.get(words, row).trials
-        new.rows[words] = replace(row, trials=before if trials is None else trials)
-    found.update(new)
     with os_errors(place):
         place.mkdir(parents=True, exist_ok=True)
+    with os_errors(place), locked(place):
+        # The curves are written first, so a collection that was killed may leave them alone.
+        begun = (place / ROWS).exists()
+        found = load(place) if begun else Results(curves=_load_curves(place / CURVES))
+        for words, row in new.rows.items():
+            before = found.rows.get(words, row).trials
+            new.rows[words] = replace(row, trials=before if trials is None else trials)
+        found.update(new)
         for group in found.groups():
             _keep_policies(found, group, place / POLICIES)
         arrays = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -198,3 +198,18 @@ def check_name(group: str, file: str, name: str) -> None:
     """
     if name != file:
         raise TsbenchError(f"conf/{group}/{file}.yaml must have name: {file}, not {name}")
+
+
+def words_of(config: RunConfig, given: Iterable[str]) -> tuple[str, ...]:
+    """The words of a run in one order, with the defaults of task, method, budget and seed, and
+    without those that change no result."""
+    said = {
+        "task": config.task.name,
+        "method": config.method["name"],
+        "budget": config.budget,
+        "seed": config.seed,
+    }
+    plain = {word.lstrip("+~") for word in given}
+    others = {word for word in plain if word.partition("=")[0] not in (*said, *ELSEWHERE)}
+    others = {word for word in others if not word.startswith(("hydra.", "hydra/"))}
+    return (*(f"{key}={value}" for key, value in said.items()), *sorted(others))

@@ -9,7 +9,6 @@ comes next takes over its trial and resumes its runs.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import warnings
@@ -31,11 +30,12 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from tsbench.core import plugins
 from tsbench.core.errors import NotFiniteError, PlanError, TsbenchError, os_errors
+from tsbench.core.files import lock, locked
 from tsbench.core.typed import typed
 from tsbench.evaluation.score import Score
 from tsbench.runs import config, execute
 from tsbench.runs.directory import RunDirectory
-from tsbench.runs.schema import RunConfig
+from tsbench.runs.schema import RunConfig, words_of
 
 # No final run has these seeds: those of a table count up from 0.
 FIRST_SEED = 1_000_000
@@ -230,7 +230,7 @@ def _work(study: Study, shared: optuna.Study, trial: Trial, run: Execute) -> str
     for seed in study.seeds:
         made = study.run(trial.number, trial.params, seed)
         try:
-            run(made, study.chosen(trial.params))
+            run(made, [*study.chosen(trial.params), f"seed={seed}"])
         except NotFiniteError as error:  # these settings diverge
             shared.tell(trial, state=TrialState.FAIL)
             return f"{about} failed: {error}"
@@ -257,9 +257,9 @@ def _opened(study: Study) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     # As JSON gives it back, which has lists for tuples.
     space = {key: asdict(dimension) for key, dimension in study.space.items()}
-    described = {"words": sorted(study.words), "seeds": study.seeds, "space": space}
+    described = {"words": _plain(study.words), "seeds": study.seeds, "space": space}
     identity = json.loads(json.dumps(described))
-    with _locked(study.directory / "study.lock"):
+    with locked(study.directory / "study.lock"):
         try:
             _mend(study.journal)
             backend = JournalFileBackend(str(study.journal), KernelLock(study.journal))
@@ -275,12 +275,19 @@ def _opened(study: Study) -> optuna.Study:
                 shared.set_user_attr("identity", identity)
         except (ValueError, KeyError) as error:
             raise TsbenchError(f"{study.journal} is damaged: {error}") from None
+    if known is not None:
+        known = known | {"words": _plain(known["words"])}  # as earlier versions wrote them
     if known not in (None, identity):
         raise TsbenchError(
             f"{study.directory} holds another study ({_differing(known, identity)}): "
             "study=PATH names another folder"
         )
     return shared
+
+
+def _plain(words: Sequence[str]) -> list[str]:
+    """The words that decide the trials, with the defaults of task, method and budget."""
+    return [w for w in words_of(config.compose(list(words)), words) if not w.startswith("seed=")]
 
 
 def _differing(known: Mapping[str, Any], identity: Mapping[str, Any]) -> str:
@@ -304,18 +311,18 @@ def _claimed(study: Study, shared: optuna.Study, trials: int) -> Iterator[Trial 
     """A trial that no other process works on: one that was left unfinished, else a new one; None
     if the study has its `trials` trials."""
     trial, held = None, None
-    with _locked(study.directory / "study.lock"):
+    with locked(study.directory / "study.lock"):
         known = shared.get_trials(deepcopy=False)
         for one in known:
             if one.state == TrialState.RUNNING:
-                held = _lock(study.place(one.number) / "lock", wait=False)
+                held = lock(study.place(one.number) / "lock", wait=False)
                 if held is not None:
                     trial = Trial(shared, one._trial_id)
                     break
         if trial is None and len(known) < trials:
             shared.sampler = _sampler(len(known))
             trial = shared.ask()
-            held = _lock(study.place(trial.number) / "lock", wait=True)
+            held = lock(study.place(trial.number) / "lock", wait=True)
         if trial is not None and (trial.number > 0 or trial.params):
             # An unfinished one may have been stopped before it had chosen all. Older studies have
             # chosen settings in their first trial too.
@@ -346,7 +353,7 @@ def _word(value: Any) -> str:
 
 def _mend(journal: Path) -> None:
     """Drops the last line of a journal if a killed process has written only a part of it."""
-    with _locked(KernelLock(journal).path):
+    with locked(KernelLock(journal).path):
         content = journal.read_bytes() if journal.exists() else b""
         if content and not content.endswith(b"\n"):
             os.truncate(journal, content.rfind(b"\n") + 1)
@@ -361,32 +368,9 @@ class KernelLock(JournalFileOpenLock):
         self.descriptor: int | None = None
 
     def acquire(self) -> bool:
-        self.descriptor = _lock(self.path, wait=True)
+        self.descriptor = lock(self.path, wait=True)
         return True
 
     def release(self) -> None:
         assert self.descriptor is not None
         os.close(self.descriptor)
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    descriptor = _lock(path, wait=True)
-    assert descriptor is not None
-    try:
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _lock(path: Path, *, wait: bool) -> int | None:
-    """Locks a file, which is made if need be. Returns its descriptor, or None if another process
-    has the lock and `wait` is false."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        os.close(descriptor)
-        return None
-    return descriptor

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -15,13 +16,13 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-from tsbench.core.errors import Stopped, TsbenchError
+from tsbench.core.errors import Stopped, TsbenchError, quoted
 from tsbench.core.files import append, read_file
 from tsbench.core.method import Monitor, Snapshot
 from tsbench.core.typed import typed
 from tsbench.core.words import duration, number
 from tsbench.runs.checkpoint import Checkpoint, Checkpoints
-from tsbench.runs.directory import CHECKPOINTS, LOG, MAX_METRICS, METRICS, Stage
+from tsbench.runs.directory import CHECKPOINTS, LOG, MAX_METRICS, METRICS, MOST_STAGES, Stage
 from tsbench.runs.events import Events
 
 INTERVAL = 30.0  # seconds of training between checkpoints
@@ -217,15 +218,23 @@ class RunWorkspace:
         Args:
             name: the stage's name, such as "plan" or "imitate".
             steps: environment steps that the stage may use.
+
+        Raises:
+            TsbenchError: the name cannot be that of a checkpoint, or there are too many stages.
         """
         number, learner = len(self.stages), None
+        if not re.fullmatch(r"[A-Za-z0-9_]+", name):
+            raise TsbenchError(f"a stage has a name of letters, digits and _, not {quoted(name)}")
+        if number == MOST_STAGES:
+            raise TsbenchError(f"a run has at most {MOST_STAGES} stages")
         stage = Stage(name, steps)
         if self._saved and number <= self._number:
             stage = self._saved.stages[number]
             checkpoint = self._checkpoints.newest(number)
             learner = _read(checkpoint).learner if checkpoint else None
         self.stages.append(stage)
-        if stage.steps >= stage.budget:  # it was finished when the run was interrupted
+        # Whether it was finished when the run was interrupted; one may end below its budget.
+        if number < self._number or stage.steps >= stage.budget:
             yield Finished(learner)
             return
         stage.interruptions += learner is not None
