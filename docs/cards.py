@@ -169,15 +169,17 @@ def results() -> str:
 
 # Parts of cards
 
-RESULT_COLUMNS = ("solved", "`solved_reward`", "100 N: survived", "recovered", "steps", "time")
+RESULT_COLUMNS = (
+    "solved", "`solved_reward`", "100 N: survived", "recovered", "steps", "time", "seeds",
+)  # fmt: skip
 
 
 def _figures(row: Row) -> list[str]:
     figures, (steps, _, seconds) = row.figures, row.cost
     shares = [figures[name] for name in ("success", "survival_100N", "recovery_100N")]
     solved, survived, recovered = ("" if one is None else f"{one:.0%}" for one in shares)
-    time = duration(seconds)
-    return [solved, number(row.reward.iqm), survived, recovered, short(steps), time]
+    spent = (short(steps), duration(seconds), str(len(row.entry.kept)))
+    return [solved, number(row.reward.iqm), survived, recovered, *spent]
 
 
 def _results(table: Table) -> str:
@@ -191,7 +193,7 @@ def _results(table: Table) -> str:
         shares = [f"{given[key]:.0%}" if key in given else "-" for key in keys]
         reward = number(given["solved_reward"])
         label = "`oracle`, the best plan" if name == "oracle" else f"`{name}`"
-        rows.append((label, shares[0], reward, *shares[1:], "", ""))
+        rows.append((label, shares[0], reward, *shares[1:], "", "", ""))
     return _table(("", *RESULT_COLUMNS), rows)
 
 

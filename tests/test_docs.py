@@ -36,10 +36,11 @@ import yaml
 from tsbench import cli, methods, tasks
 from tsbench.cli import arguments, verbs
 from tsbench.core.errors import TsbenchError
-from tsbench.runs import config
+from tsbench.core.words import short
+from tsbench.runs import config, schema
 
 ROOT = Path(__file__).parents[1]
-MADE = ("board.md",)  # by docs/cards.py, as are those in folders
+MADE = ("board.md", "tasks", "methods")  # by docs/cards.py
 PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
@@ -238,7 +239,7 @@ def check_pip(words: list[str]) -> None:
     ]
     assert words[0] == "install"
     for word in words[1:]:
-        if asked := re.fullmatch(r"(?:tsbench|\.)\[(.*)\]", word):
+        if asked := re.fullmatch(r"\.\[(.*)\]", word):  # of a clone: no registry has tsbench
             assert set(asked[1].split(",")) <= extras.keys()
         elif word.startswith((".", "/")):
             assert (ROOT / word).exists()
@@ -323,7 +324,8 @@ def test_data_is_valid(language: str) -> None:
 def test_links_and_named_files_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
-        if not target.startswith("https://") and target.partition("/")[0] not in (*MADE, "tasks"):
+        if not target.startswith("https://"):
+            assert target.partition("/")[0] not in MADE, f"{target}: a checkout does not have it"
             assert (page.parent / target).exists(), target
     for name in re.findall(r"`((?:tests|benchmarks|tsbench|examples)/[\w/.-]+)`", text):
         stands_for_yours = "NAME" in name or page.stem == "extending"
@@ -334,6 +336,17 @@ def test_the_readme_links_every_page() -> None:
     readme = PAGES[0].read_text(encoding="utf-8")
     pages = [f"docs/{page.name}" for page in PAGES if page.parent != ROOT]
     assert [page for page in pages if f"]({page})" not in readme] == []
+
+
+def test_runs_has_the_budgets_of_each_task() -> None:
+    table = (ROOT / "docs" / "runs.md").read_text(encoding="utf-8")
+    for name in tasks.names():
+        budgets = schema.budgets(name)
+        sums = [
+            f"{short(budgets[b].plan)} + {short(budgets[b].act)}"
+            for b in ("smoke", "fast", "paper")
+        ]
+        assert re.search(rf"^\| .*`{name}`.* \| {re.escape(' | '.join(sums))} \|$", table, re.M)
 
 
 # Cards
@@ -383,4 +396,5 @@ def test_a_card_shows_its_film(tmp_path: Path) -> None:
 def test_the_readme_has_the_results_of_the_board() -> None:
     readme = PAGES[0].read_text(encoding="utf-8")
     assert cards().results() in readme
+    assert " seeds |" in cards().results().partition("\n")[0]
     assert cards().with_results(readme) == readme, "run `python docs/cards.py`"
