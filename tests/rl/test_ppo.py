@@ -381,6 +381,7 @@ def test_settings() -> None:
     for asked, given in ((999, 16), (8, 8), (None, 16)):
         plan = {} if asked is None else {"environments": asked}
         assert settings(problem(16, plan=plan), "plan").environments == given
+    assert settings(problem(4096), "plan").environments == StageSettings.environments
     # Fine-tuning continues with the network of the imitation stage.
     both = problem(imitate={"hidden": [8], "entropy": 0.1}, finetune={"entropy": 0.2})
     assert settings(both, "finetune") == StageSettings(hidden=(8,), entropy=0.2)

@@ -7,12 +7,17 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tsbench import tasks
 from tsbench.core.errors import TsbenchError
+from tsbench.core.method import Budget, Problem
 from tsbench.rl import processes
+from tsbench.rl.stages import physics_environment, settings
 from tsbench.runs.execute import resume
 
 # Trains the planner and prints what should be equal in both processes, and what should not.
@@ -96,6 +101,18 @@ def test_only_the_first_process_writes_a_run(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "run" / "versions.json").read_text())["processes"] == 2
     stages = json.loads((tmp_path / "run" / "score.json").read_text())["stages"]
     assert [stage["steps"] for stage in stages] == [128, 128]
+
+
+def test_the_rise_counts_the_steps_of_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    disturb = {"push": 100.0, "rise": 1000, "latency": 2}
+    training = {"imitate": {"environments": 2, "disturb": disturb}}
+    task = tasks.make("rocket_navigation")
+    problem = Problem(task, Budget(1, 1), training, {}, seed=0, threads=1)
+    chosen = settings(problem, "imitate")
+    physics: Any = physics_environment(problem, task, chosen).dynamics
+    assert chosen.disturb.rise == 1000
+    assert physics.disturbances == replace(chosen.disturb, rise=250)
 
 
 def test_what_several_processes_cannot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -132,15 +132,20 @@ class PPOSettings:
         return [f"{name}: {value}" for name, value in given.items() if value != only[name]]
 
 
-def iteration_steps(
-    training: Mapping[str, Mapping[str, Any]], kind: str, environments: int | None
-) -> int:
+def environments(changes: Mapping[str, Any], most: int | None) -> int:
+    """How many episodes are stepped together under these changes to the settings, and a budget that
+    allows `most`."""
+    wanted: int = changes.get("environments", PPOSettings.environments)
+    return wanted if most is None else min(wanted, most)
+
+
+def iteration_steps(training: Mapping[str, Mapping[str, Any]], kind: str, most: int | None) -> int:
     """`PPOSettings.steps` of a kind of stage, of settings that need not be valid.
 
     Args:
         training: changes to the settings of each kind.
         kind: of stage; the defaults hold for one without changes.
-        environments: at most.
+        most: environments that the budget allows; None for any number.
     """
     given = {**training.get("imitate", {})} if kind in AFTER_IMITATION else {}
     given |= training.get(kind, {})
@@ -148,6 +153,5 @@ def iteration_steps(
     for name in ("environments", "rollout", "repeat"):
         size = given.get(name, getattr(PPOSettings, name))
         sizes[name] = max(size, 1) if isinstance(size, int) else 1
-    if environments is not None:
-        sizes["environments"] = min(sizes["environments"], environments)
+    sizes["environments"] = environments(sizes, most)
     return math.prod(sizes.values())

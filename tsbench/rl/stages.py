@@ -19,7 +19,7 @@ from tsbench.rl import processes
 from tsbench.rl.devices import CPU, torch_device, working_on
 from tsbench.rl.ppo import Learner, Report
 from tsbench.rl.settings import AFTER_IMITATION as AFTER_IMITATION  # methods use it too
-from tsbench.rl.settings import PPOSettings
+from tsbench.rl.settings import PPOSettings, environments
 from tsbench.sim.batched import BatchedEnvironment
 from tsbench.sim.device import DeviceDynamics, DeviceEnvironment, DeviceKinematics
 from tsbench.sim.disturbed import Disturbances, DisturbedPhysics
@@ -50,8 +50,7 @@ def settings(problem: Problem, kind: str) -> StageSettings:
         TsbenchError: unknown names or values of the wrong type or range.
     """
     changes = _changes(problem, kind)
-    if (most := problem.budget.environments) is not None:
-        changes["environments"] = min(changes.get("environments", most), most)
+    changes["environments"] = environments(changes, problem.budget.environments)
     disturb = changes.get("disturb", Disturbances())
     if kind == "plan" and disturb != Disturbances():
         raise TsbenchError("task.training.plan.disturb: planning has no physics to disturb")
@@ -149,7 +148,9 @@ def physics_environment(
     problem: Problem, task: SimulatedTask[Any], chosen: StageSettings
 ) -> Environment:
     """Episodes of a task in full physics on the problem's device, disturbed as `chosen` says."""
-    count, disturb, seed = chosen.environments, chosen.disturb, processes.own(problem.seed)
+    count, seed = chosen.environments, processes.own(problem.seed)
+    # The physics counts the steps of its own process, and `rise` those of all.
+    disturb = replace(chosen.disturb, rise=chosen.disturb.rise // processes.count())
     if problem.device == CPU:
         physics: Physics[Any] = DisturbedPhysics(
             task, count, disturb, seed, threads=problem.threads
