@@ -17,6 +17,7 @@ A task ends its episodes itself, at its horizon. `max_episode_steps` can only en
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import gymnasium
@@ -114,4 +115,5 @@ def _register(name: str) -> None:
 # By it `gymnasium.make` knows which modes its own wrappers have to add.
 make.metadata = GymEnvironment.metadata  # type: ignore[attr-defined]
 for _name in tasks.names():
-    _register(_name)
+    with suppress(TsbenchError):  # a plug-in's task that cannot be made; `make` says why
+        _register(_name)

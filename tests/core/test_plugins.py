@@ -248,6 +248,20 @@ def test_a_broken_promise_is_listed_and_refused(toy: Toy, tmp_path: Path) -> Non
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_task_that_cannot_be_made_leaves_the_others_to_gymnasium(
+    toy: Toy, tmp_path: Path
+) -> None:
+    sunk = 'raise ValueError("sunk")\n    return Flight'
+    (toy.folder / "task.py").write_text(TASK.replace("return Flight", sunk))
+    program = (
+        f"import gymnasium, tsbench.gym; gymnasium.spec(tsbench.gym.identifier({SOME!r}))\n"
+        "try: tsbench.gym.make('toy_flight')\n"
+        "except tsbench.TsbenchError as error: print(error)"
+    )
+    done = python(tmp_path, "-c", program)
+    assert done.stdout == "toy_flight cannot be made: sunk\n", done.stderr
+
+
 def test_a_configuration_of_another_name(toy: Toy, tmp_path: Path) -> None:
     """It is told by `tsbench run` and by `tsbench list`, which goes on to show the others."""
     file = toy.folder / "conf" / "task" / "toy_flight.yaml"

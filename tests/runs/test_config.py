@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import pytest
 
@@ -163,6 +164,8 @@ class Outer:
     rate: float = 0.5
     sizes: tuple[int, ...] = ()
     by_name: dict[str, bool] | None = None
+    form: Literal["timed", "free"] = "timed"
+    few: int | str | None = None
 
     def __post_init__(self) -> None:
         if self.rate < 0.0:
@@ -171,9 +174,12 @@ class Outer:
 
 def test_typed_builds_what_the_annotations_say() -> None:
     content = {"inner": {"size": 3}, "rate": 1, "sizes": [1, 2], "by_name": {"a": True}}
+    values: dict[str, Any]
     built = typed(Outer, content, "")
     assert built == Outer(Inner(3), 1.0, (1, 2), {"a": True})
     assert type(built.rate) is float
+    for values in ({"form": "free", "few": "all"}, {"few": 3}, {"few": None}):
+        assert typed(Outer, {**content, **values}, "") == replace(built, **values)
 
 
 @pytest.mark.parametrize(
@@ -190,6 +196,8 @@ def test_typed_builds_what_the_annotations_say() -> None:
         ({"inner": {"size": 3}, "rate": 10**400}, "rate must be a number, not 1000"),
         ({"inner": {"size": 3}, "rate": -1.0}, "rate must not be negative"),
         ({"inner": {"size": 3, "szie": 4}}, "unknown key in inner 'szie'; allowed: size"),
+        ({"inner": {"size": 3}, "form": "x"}, "form must be one of timed, free, not 'x'"),
+        ({"inner": {"size": 3}, "few": 1.5}, "few must be a whole number or text or null, not 1.5"),
         ([1], "the content must be key: value pairs, not [1]"),
     ],
 )

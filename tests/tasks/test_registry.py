@@ -71,6 +71,20 @@ def test_a_task_that_cannot_be_made_says_why(monkeypatch: pytest.MonkeyPatch) ->
         tasks.make("sunk", depth=2.0)
 
 
+def test_a_constant_that_is_true_or_false(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks, "_factories", dict(tasks._factories))
+    made: list[bool] = []
+
+    def walled(walls: bool = True) -> Any:
+        made.append(walls)
+
+    tasks.register("walled")(walled)
+    tasks.make("walled", walls=False)
+    assert made == [False]
+    with pytest.raises(TsbenchError, match=r"^walls of walled must be true or false, not 1$"):
+        tasks.make("walled", walls=1)
+
+
 def test_a_new_task_needs_no_list(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "stroll" not in tasks.names()
     monkeypatch.setattr(tasks, "_factories", dict(tasks._factories))

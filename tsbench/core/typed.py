@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tsbench.core.errors import TsbenchError, quoted, unknown
 
@@ -16,7 +17,9 @@ def typed(kind: Any, value: Any, path: str) -> Any:
     Numbers are never rounded, and text is never read as a number. A whole number is a valid float.
 
     Args:
-        kind: a type annotation.
+        kind: a type annotation: `bool`, `int`, `float`, `str`, `None`, `Any`, a dataclass,
+            `Literal[...]`, `list[X]`, `tuple[X, ...]`, `dict[str, X]` or `Mapping[str, X]`, or a
+            union of such, of which the first kind that the value fits counts.
         value: a value from YAML or JSON.
         path: the dotted key, for messages.
 
@@ -35,9 +38,17 @@ def typed(kind: Any, value: Any, path: str) -> Any:
     if kind is Any:
         return value
     origin, arguments = get_origin(kind), get_args(kind)
-    if origin in (Union, types.UnionType) and type(None) in arguments:
-        (rest,) = (argument for argument in arguments if argument is not type(None))
-        return None if value is None else typed(rest, value, path)
+    if origin in _UNIONS:
+        if value is None and type(None) in arguments:
+            return None
+        several = [argument for argument in arguments if argument is not type(None)]
+        if len(several) == 1:
+            return typed(several[0], value, path)
+        for one in several:
+            with suppress(TsbenchError):
+                return typed(one, value, path)
+    if origin is Literal and any(type(value) is type(a) and value == a for a in arguments):
+        return value
     if origin in (dict, Mapping) and isinstance(value, Mapping):
         return {str(k): typed(arguments[1], v, _join(path, str(k))) for k, v in value.items()}
     if origin in (list, tuple) and isinstance(value, (list, tuple)):
@@ -46,8 +57,7 @@ def typed(kind: Any, value: Any, path: str) -> Any:
         return float(value)
     if type(value) is kind:
         return value
-    wanted = _WORDS.get(kind) or _WORDS.get(origin) or str(kind)
-    raise TsbenchError(f"{path or 'the content'} must be {wanted}, not {quoted(value)}")
+    raise TsbenchError(f"{path or 'the content'} must be {_words(kind)}, not {quoted(value)}")
 
 
 def typed_items(kind: type, value: Any, path: str) -> dict[str, Any]:
@@ -71,11 +81,23 @@ def unknown_key(path: str, name: str, allowed: Iterable[str]) -> TsbenchError:
     return unknown(f"key in {path}" if path else "key", name, allowed)
 
 
+def _words(kind: Any) -> str:
+    """What a value has to be, in words."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if origin in _UNIONS:
+        return " or ".join(map(_words, arguments))
+    return _WORDS.get(kind) or _WORDS.get(origin) or str(kind)
+
+
 def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
+_UNIONS = (Union, types.UnionType)
 _WORDS = {
+    type(None): "null",
     bool: "true or false",
     int: "a whole number",
     float: "a number",

@@ -82,8 +82,12 @@ def make(name: str, **constants: Any) -> Task[Any]:
     for constant, value in constants.items():
         if constant not in allowed:
             raise unknown(f"constant of {name}", constant, allowed)
-        number = isinstance(allowed[constant].default, (int, float))
-        if number and (isinstance(value, bool) or not isinstance(value, (int, float))):
+        default = allowed[constant].default
+        boolean = isinstance(default, bool)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if boolean and not isinstance(value, bool):
+            raise TsbenchError(f"{constant} of {name} must be true or false, not {value!r}")
+        if isinstance(default, (int, float)) and not boolean and not number:
             raise TsbenchError(f"{constant} of {name} must be a number, not {value!r}")
     try:
         return factory(**constants)
