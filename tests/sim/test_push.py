@@ -40,7 +40,7 @@ def test_forces_by_hand() -> None:
 
 
 @given(
-    st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.sampled_from([1 / 30, 1 / 50]), st.floats(-1, 1)
+    st.floats(0.0, 1.0), st.floats(1e-3, 1.0), st.sampled_from([1 / 30, 1 / 50]), st.floats(-1, 1)
 )
 def test_the_whole_impulse_arrives(
     time: float, duration: float, timestep: float, force: float
@@ -144,6 +144,32 @@ def test_a_new_episode_is_pushed_again() -> None:
         speeds.append(batch.state.velocity[0, 0])
     assert speeds[:15] == speeds[15:]
     assert speeds[4] == 0.0 < speeds[5]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"force": np.zeros(2)}, r"^force of a push must have the shape \(3,\) or \(n, 3\), not"),
+        ({"force": 5.0}, r"^force of a push must have the shape"),
+        ({"force": np.array([np.nan, 0.0, 0.0])}, "must be finite"),
+        ({"force": ["much"] * 3}, "must be numbers"),
+        ({"force": np.zeros((4, 3))}, r"^time of a push must have the shape \(4,\)"),
+        ({"duration": np.full(3, 0.1)}, r"^duration of a push must have the shape \(\)"),
+        ({"duration": -0.1}, "^duration of a push must be positive, not -0.1$"),
+        ({"time": np.inf}, "must be finite"),
+    ],
+)
+def test_pushes_that_make_no_sense(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(TsbenchError, match=message):
+        Push(**{"time": 0.1, "duration": 0.1, "force": np.zeros(3), **changes})
+
+
+def test_as_many_pushes_as_episodes() -> None:
+    pushes = Push(np.zeros(3), np.full(3, 0.1), np.zeros((3, 3)))
+    with pytest.raises(TsbenchError, match=r"one for each of 4 episodes, not 3$"):
+        tsbench.load_batched("rocket_navigation", count=4, push=pushes, threads=1)
+    with pytest.raises(TsbenchError, match=r"one for each of 1 episodes, not 3$"):
+        tsbench.load("rocket_navigation", push=pushes)
 
 
 def test_plans_cannot_be_pushed() -> None:

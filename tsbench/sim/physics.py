@@ -56,7 +56,13 @@ class Physics(Generic[S]):
         push: Push | None = None,
         change: Change | None = None,
     ) -> None:
-        """`threads` None means all cores; `perturbed` picks the task's perturbed starts."""
+        """`threads` None means all cores; `perturbed` picks the task's perturbed starts.
+
+        Raises:
+            TsbenchError: there are more or fewer pushes than simulations.
+        """
+        if push is not None:
+            push.expect_count(count)
         self.task = task
         self.plant = task.plant
         self.perturbed = perturbed

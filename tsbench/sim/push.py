@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from tsbench.core.errors import TsbenchError
 from tsbench.core.task import Plant
 
 
@@ -32,6 +33,43 @@ class Push:
     time: np.ndarray | float
     duration: np.ndarray | float
     force: np.ndarray
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TsbenchError: a field is no finite number or has another shape, or the push has no
+                duration.
+        """
+        try:
+            time, duration, force = (np.asarray(value, float) for value in vars(self).values())
+        except (TypeError, ValueError):
+            raise TsbenchError("time, duration and force of a push must be numbers") from None
+        if force.ndim not in (1, 2) or force.shape[-1] != 3:
+            raise TsbenchError(
+                f"force of a push must have the shape (3,) or (n, 3), not {force.shape}"
+            )
+        for name, value in (("time", time), ("duration", duration)):
+            if value.shape != force.shape[:-1]:
+                raise TsbenchError(
+                    f"{name} of a push must have the shape {force.shape[:-1]}, as its force has "
+                    f"{force.shape}, not {value.shape}"
+                )
+        if not all(np.isfinite(value).all() for value in (time, duration, force)):
+            raise TsbenchError("time, duration and force of a push must be finite")
+        if not (duration > 0.0).all():
+            raise TsbenchError(f"duration of a push must be positive, not {duration.min()}")
+
+    def expect_count(self, count: int) -> None:
+        """Checks that there is a push for each of `count` episodes, or one for all.
+
+        Raises:
+            TsbenchError: there are more or fewer.
+        """
+        if np.ndim(self.force) == 2 and len(self.force) != count:
+            raise TsbenchError(
+                f"there must be one push, or one for each of {count} episodes, "
+                f"not {len(self.force)}"
+            )
 
     def rows(self, rows: np.ndarray | slice) -> Push:
         """The pushes of some members of the batch; a push for all episodes is returned as it is."""

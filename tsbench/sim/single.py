@@ -174,6 +174,8 @@ class PhysicsAdapter(Adapter):
         self, task: SimulatedTask[Any], rng: np.random.Generator, perturbed: bool, push: Push | None
     ) -> None:
         super().__init__(task, rng)
+        if push is not None:
+            push.expect_count(1)
         self.task = task
         self.plant = task.plant
         self.perturbed = perturbed

@@ -746,7 +746,13 @@ class HostPhysics(Generic[S]):
         change: Change | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        """`device` None means a GPU where there is one; `threads` has no effect."""
+        """`device` None means a GPU where there is one; `threads` has no effect.
+
+        Raises:
+            TsbenchError: there are more or fewer pushes than simulations, or no such device.
+        """
+        if push is not None:
+            push.expect_count(count)
         self.task = task
         self.plant = task.plant
         self.perturbed = perturbed
