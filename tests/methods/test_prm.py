@@ -86,6 +86,8 @@ def test_a_layered_roadmap_beats_the_hand_made_planner(tmp_path: Path) -> None:
         ("rocket_navigation", {"roadmap": "layered"}, "rocket_navigation has no gait"),
         ("rocket_navigation", {"samples": -1}, "method.samples must lie in"),
         ("rocket_navigation", {"neighbours": 0}, "method.neighbours must lie in"),
+        ("rocket_navigation", {"samples": 21_000}, "method.samples must lie in 0 to 19,998, not"),
+        ("rocket_navigation", {"samples": 19_000, "neighbours": 100}, "lie in 1 to 52 with 19,000"),
         ("rocket_obstacles", {"samples": 0, "neighbours": 1}, "has no way to the goal"),
     ],
 )

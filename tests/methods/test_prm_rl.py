@@ -72,6 +72,18 @@ def test_a_sent_policy_flies_as_it_does_to_the_goal() -> None:
     np.testing.assert_allclose(flights[0], flights[1], atol=1e-6)
 
 
+def test_a_critic_sees_what_the_task_shows_it() -> None:
+    class Shown(Rocket):
+        def value_observation(self, state: Any) -> Any:
+            return state.position
+
+    task = Shown(**vars(tasks.make("rocket_navigation")))
+    space, point = space_of(task), np.array([3.0, 1.0])
+    state = plannable(task).abstraction().start(2)
+    seen = Sent(task, space, always(point), 100).value_observation(state)
+    np.testing.assert_array_equal(seen, state.position + (space.goal - point))
+
+
 def test_a_leg_ends_where_it_leads() -> None:
     task = tasks.make("rocket_navigation")
     space = space_of(task)
@@ -166,6 +178,7 @@ def test_an_interrupted_run_ends_with_the_same_bits(
     words = [
         "task=rocket_navigation", "method=prm_rl", "budget=smoke", "threads=1", "checkpoint=0",
         "task.budgets.smoke.act=2000", "task.constants.distance=8.0", "method.rollouts=2",
+        "method.least=0.3",
         "task.training.imitate.rollout=2", "task.training.imitate.minibatches=2",
     ]  # fmt: skip
 
@@ -198,6 +211,8 @@ def test_an_interrupted_run_ends_with_the_same_bits(
     [
         ("laikago_trot", {}, "the method prm_rl cannot do laikago_trot: no policy goes to any"),
         ("rocket_navigation", {"rollouts": 1}, "method.rollouts must lie in 2 to 10000, not 1"),
+        ("rocket_navigation", {"samples": 21_000}, "method.samples must lie in 0 to 19,998, not"),
+        ("rocket_navigation", {"rollouts": 8}, "method.least must be at most 0.676, the bound of"),
         ("rocket_navigation", {"drive": 0.9, "test": 0.1}, "must leave a share of the budget"),
         ("rocket_navigation", {"audit": "skip"}, "method.audit must be stop, warn or null"),
     ],

@@ -16,7 +16,7 @@ from tsbench.core.motion import Plan
 from tsbench.core.policy import Policy
 from tsbench.core.task import Task, plannable, roadmap_space
 from tsbench.methods import options, planned_task
-from tsbench.planning.roadmap import cycled, find_route
+from tsbench.planning.roadmap import cycled, expect_size, find_route
 from tsbench.rl.stages import AFTER_IMITATION, ImitationOptions, learn_imitation
 from tsbench.sim.kinematic import plan_along, rolled_out
 
@@ -29,8 +29,9 @@ class Options(ImitationOptions):
     """Attributes:
     roadmap: "blind", whose points know nothing of the task's gait (the paper's), or "layered" by
         the phase of the gait, which needs no samples.
-    samples: Halton samples of a blind roadmap.
-    neighbours: nearest samples that each of them is joined to.
+    samples: Halton samples of a blind roadmap, at most `roadmap.MOST_SAMPLES`.
+    neighbours: nearest samples that each of them is joined to; samples times neighbours may be
+        `roadmap.MOST_PAIRS`.
     shortcut: whether the way through a blind roadmap is straightened; the paper's is not.
     """
 
@@ -44,10 +45,7 @@ class Options(ImitationOptions):
         super().__post_init__()
         if self.roadmap not in ROADMAPS:
             raise ValueError(f"roadmap must be one of {', '.join(ROADMAPS)}, not {self.roadmap}")
-        if not 0 <= self.samples <= 1_000_000:
-            raise ValueError(f"samples must lie in 0 to 1,000,000, not {self.samples}")
-        if not 1 <= self.neighbours <= 1000:
-            raise ValueError(f"neighbours must lie in 1 to 1000, not {self.neighbours}")
+        expect_size(self.samples, self.neighbours)
 
 
 def train(problem: Problem, workspace: Workspace) -> Policy:

@@ -4,7 +4,9 @@
    sees its state moved along with the world so that the point lies at the goal.
 2. Roadmap: the edges on the quickest way are driven some times each, from rest and from the task's
    noisy starts. An edge is kept if the lower Wilson bound of its success is high enough; else the
-   next quickest way is tried. Edges that lie on no such way are not driven, to save steps.
+   next quickest way is tried. Edges that lie on no such way are not driven, to save steps. An edge
+   is driven in the direction of the way that is tried first, and its verdict holds for ways in the
+   other direction too, though gravity makes the two differ.
 3. Distil: the policy is sent from corner to corner of the way. Which corner is next depends on the
    position alone, so all that is a function of the task's observation. A network learns it by
    DAgger (Ross et al. 2011): in each round the network flies, and the sent policy says what it
@@ -31,7 +33,15 @@ from tsbench.core.roadmap import DrivableSpace
 from tsbench.core.state import Rng, S, Start
 from tsbench.core.task import Plant, SimulatedTask, Task, plannable, roadmap_space
 from tsbench.methods import options, planned_task
-from tsbench.planning.roadmap import Graph, Route, connected, no_way, resampled, sampled
+from tsbench.planning.roadmap import (
+    Graph,
+    Route,
+    connected,
+    expect_size,
+    no_way,
+    resampled,
+    sampled,
+)
 from tsbench.rl.distil import Lesson, distilled
 from tsbench.rl.stages import learn_physics, settings
 from tsbench.sim.episodes import PolicyFunction, play
@@ -52,11 +62,13 @@ CONFIDENCE = 0.95  # of the Wilson bounds
 @dataclass(frozen=True)
 class Options:
     """Attributes:
-    samples: Halton samples of the roadmap.
-    neighbours: nearest samples that each of them is joined to.
+    samples: Halton samples of the roadmap, at most `roadmap.MOST_SAMPLES`.
+    neighbours: nearest samples that each of them is joined to; samples times neighbours may be
+        `roadmap.MOST_PAIRS`.
     reach: length of an edge at most, in plan steps; from as far away driving is learned.
     rollouts: how often an edge is driven: once from the nominal start, else from perturbed ones.
-    least: lower Wilson bound of an edge's success that keeps it.
+    least: lower Wilson bound of an edge's success that keeps it; at most that of an edge which all
+        rollouts drive.
     drive: share of the physics budget spent on learning to drive.
     test: share spent on driving edges; the rest is for distilling.
     audit: what a way with edges that cannot be driven does: "stop" ends the run, "warn" goes on;
@@ -74,15 +86,26 @@ class Options:
 
     def __post_init__(self) -> None:
         for name, low, high in (
-            ("samples", 0, 1_000_000), ("neighbours", 1, 1000), ("rollouts", 2, 10_000),
-            ("reach", 1.0, 1e6), ("least", 0.0, 1.0), ("drive", 0.01, 0.98), ("test", 0.0, 0.98),
+            ("rollouts", 2, 10_000), ("reach", 1.0, 1e6), ("least", 0.0, 1.0),
+            ("drive", 0.01, 0.98), ("test", 0.0, 0.98),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name} must lie in {low} to {high}, not {getattr(self, name)}")
+        expect_size(self.samples, self.neighbours)
+        if (most := lower_bound(self.rollouts, self.rollouts)) < self.least:
+            raise ValueError(
+                f"least must be at most {most:.3f}, the bound of an edge that all {self.rollouts} "
+                f"rollouts drive, not {self.least}: no edge would be kept"
+            )
         if self.drive + self.test > 0.99:
             raise ValueError("test and drive must leave a share of the budget to distil with")
         if self.audit not in (None, *AUDITS):
             raise ValueError(f"audit must be stop, warn or null, not {self.audit}")
+
+
+def lower_bound(driven: int, rollouts: int) -> float:
+    """The lower Wilson bound of the success of an edge that was driven so often."""
+    return float(binomtest(driven, rollouts).proportion_ci(CONFIDENCE, "wilson").low)
 
 
 def train(problem: Problem, workspace: Workspace) -> Policy:
@@ -131,6 +154,9 @@ class Sent(SimulatedTask[S]):
 
     def observation(self, state: S) -> Array:
         return self.task.observation(self.space.sent(state, self.target(state)))
+
+    def value_observation(self, state: S) -> Array:
+        return self.task.value_observation(self.space.sent(state, self.target(state)))
 
     def reward(self, previous: S, action: Array, state: S) -> Array:
         return self.task.reward(previous, action, state)
@@ -212,8 +238,7 @@ def drivable_route(
             begin = physics.place(np.arange(rollouts), start)
             episodes = play(leg, physics, driver, rollouts, begin=begin)
             driven = int((leg.reached(episodes.final) & ~episodes.course.violated).sum())
-            bound = binomtest(driven, rollouts).proportion_ci(CONFIDENCE, "wilson").low
-            kept[edge] = bool(bound >= chosen.least)
+            kept[edge] = lower_bound(driven, rollouts) >= chosen.least
             if not kept[edge]:
                 graph.costs[edge] *= DETOUR
             taken += int(episodes.lengths.sum())

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
 from tsbench.core.errors import PlanError
-from tsbench.core.motion import Plan, Roadmap
+from tsbench.core.motion import MAX_FRAMES, Plan, Roadmap
 from tsbench.core.roadmap import Lattice, RoadmapSpace
 
 # Of two ways that take equally long the straighter one is taken: each unit of length, in plan
@@ -26,6 +26,10 @@ LENGTH_COST = 1e-3
 BLOCK = 100_000  # edges that are checked together
 ROUNDS = 20  # of shortcutting, at most
 MOST_POINTS = 500  # of a way, besides its corners, that shortcuts may join
+# What the file of a roadmap holds (`core.motion`): beside start and goal so many nodes, and as many
+# edges as there are pairs of near samples.
+MOST_SAMPLES = MAX_FRAMES - 2
+MOST_PAIRS = 1_000_000
 CYCLES = 2  # that a layered roadmap looks ahead
 
 
@@ -85,6 +89,21 @@ class Route:
             edges=self.graph.edges,
             path=space.places(self.corners),
             checked=self.graph.checked,
+        )
+
+
+def expect_size(samples: int, neighbours: int) -> None:
+    """Checks that the file of a roadmap will hold it, before it is planned with.
+
+    Raises:
+        ValueError: there are too many samples or neighbours, or fewer than none.
+    """
+    if not 0 <= samples <= MOST_SAMPLES:
+        raise ValueError(f"samples must lie in 0 to {MOST_SAMPLES:,}, not {samples}")
+    most = MOST_PAIRS // max(samples, 1000)
+    if not 1 <= neighbours <= most:
+        raise ValueError(
+            f"neighbours must lie in 1 to {most:,} with {samples:,} samples, not {neighbours}"
         )
 
 
