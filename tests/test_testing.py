@@ -140,3 +140,20 @@ def test_a_planner_beyond_its_actions_is_found(make: Make) -> None:
 
     with pytest.raises(AssertionError):
         check(make(abstraction=abstraction))
+
+
+def test_a_planning_step_too_few_is_found(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But not what rounding leaves: 120 * 0.02 s are less than 48 * 0.05 s by 4e-16 s."""
+    check, name = PlanningContract().test_the_sizes_are_the_tasks, make()
+    (factory,) = tasks._factories[name].values()
+    made: Any = factory()
+    monkeypatch.setitem(tasks._factories, name, {"x": lambda: replace(made, horizon=120)})
+    check(Case(name, "planning"))
+
+    def abstraction(self: Rocket) -> Any:
+        found = Rocket.abstraction(self)
+        found.horizon -= 1
+        return found
+
+    with pytest.raises(AssertionError):
+        check(Case(make(abstraction=abstraction), "planning"))

@@ -335,7 +335,7 @@ def test_phases_are_one_gait_cycle() -> None:
     assert len(rocket) == 16
     assert rocket[0] == 16
     assert rocket[-1] == 503  # the planner's flight takes 519 steps
-    assert tasks.make("laikago_trot", distance=0.1).push_steps == (3, 4, 5)
+    assert tasks.make("laikago_trot", distance=0.11).push_steps == (3, 4, 5, 6)
 
 
 def test_common_random_numbers() -> None:
@@ -369,6 +369,13 @@ def test_changes_do_what_they_say() -> None:
     np.testing.assert_array_equal(model.geom_friction, 0.5 * before[0])
     np.testing.assert_array_equal(model.actuator_forcerange, 0.8 * before[1])
     assert model.body_subtreemass[0] == pytest.approx(25.433)
+    pair = (
+        '<worldbody><geom name="a" size="1"/><body><freejoint/><geom name="b" size="1"/></body>'
+        '</worldbody><contact><pair geom1="a" geom2="b" friction="1 1 1 1 1"/></contact>'
+    )
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{pair}</mujoco>")
+    Change(friction=0.5).apply(model)
+    np.testing.assert_array_equal(model.pair_friction, 0.5)
 
 
 def test_another_contact_model() -> None:

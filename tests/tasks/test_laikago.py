@@ -17,6 +17,7 @@ from tsbench import TsbenchError, tasks
 from tsbench.core import rotations
 from tsbench.core.motion import Plan, ReferenceMotion
 from tsbench.core.state import Start
+from tsbench.sim.kinematic import naive_plan
 from tsbench.sim.model import compiled
 from tsbench.sim.physics import Physics
 from tsbench.tasks import laikago
@@ -106,6 +107,18 @@ def test_constants(name: str, distance: float, speed: float) -> None:
 @pytest.mark.parametrize(("distance", "horizon"), [(1.0, 60), (2.0, 120), (5.0, 300)])
 def test_the_horizon_grows_with_the_distance(distance: float, horizon: int) -> None:
     assert make("laikago_trot", distance=distance).horizon == horizon
+
+
+def test_the_least_cycles_of_a_gait() -> None:
+    """They decide `solved_reward`, but no hash of constants tells another number, because the kept
+    entries have that hash. So another number needs another version of the tasks."""
+    assert (laikago.LEAST_CYCLES, make("laikago_walk").version) == (2, 1)
+
+
+def test_it_does_not_start_at_its_goal() -> None:
+    with pytest.raises(TsbenchError, match=r"the distance must lie between 0.1 and 1000 m$"):
+        make("laikago_trot", distance=0.1)
+    assert len(naive_plan(make("laikago_trot", distance=0.11)).rewards) >= 1
 
 
 # Reward

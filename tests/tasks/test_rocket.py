@@ -88,6 +88,13 @@ def test_the_horizon_grows_with_the_distance(distance: float, horizon: int) -> N
     assert np.linalg.norm(task.goal) == pytest.approx(distance)
 
 
+@pytest.mark.parametrize(("horizon", "steps"), [(120, 48), (121, 48), (124, 49), (779, 311)])
+def test_planning_takes_all_whole_steps(horizon: int, steps: int) -> None:
+    """In 120 steps of 0.02 s go 48 of 0.05 s, though 120 * 0.02 / 0.05 is rounded to less."""
+    task = replace(rocket(), horizon=horizon)
+    assert task.abstraction().horizon == steps
+
+
 # Reward
 
 

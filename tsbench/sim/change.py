@@ -60,6 +60,7 @@ class Change:
         model.body_mass *= self.mass
         model.body_inertia *= self.mass
         model.geom_friction *= self.friction
+        model.pair_friction *= self.friction
         model.actuator_gainprm *= self.strength
         model.actuator_biasprm *= self.strength
         model.actuator_forcerange *= self.strength

@@ -950,8 +950,8 @@ def filter_memory(joints: np.ndarray) -> np.ndarray:
 def _laikago(name: str, gait: Gait, distance: float, standard: float) -> Laikago:
     """At the standard distance, 0.8 of what the gait's top speed goes in it, the horizon is 6 s; at
     others it is in proportion."""
-    if not gait.base_speed * PLAN_TIMESTEP <= distance < 1e3:
-        raise ValueError("the distance must lie between one plan step and 1000 m")
+    if not C.goal_tolerance < distance < 1e3:
+        raise ValueError(f"the distance must lie between {C.goal_tolerance} and 1000 m")
     horizon = round(distance / standard * C.horizon)
     return Laikago(name=name, gait=gait, distance=float(distance), horizon=horizon)
 

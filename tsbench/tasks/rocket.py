@@ -427,7 +427,7 @@ class RocketAbstraction(Abstraction[RocketState]):
 
     def __init__(self, task: Rocket) -> None:
         self.task = task
-        self.horizon = int(task.horizon * task.timestep / C.plan_timestep)
+        self.horizon = int(task.horizon * task.timestep / C.plan_timestep + 1e-9)
 
     def start(self, count: int) -> RocketState:
         zeros = np.zeros(count)

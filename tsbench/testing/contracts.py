@@ -289,8 +289,8 @@ class PlanningContract(Contract):
     def test_the_sizes_are_the_tasks(self, case: Case) -> None:
         subject, task = mdp(case.load()), tasks.make(case.name)
         if case.variant == "planning":  # as long as the task's episodes, in whole planning steps
-            duration = subject.horizon * subject.timestep
-            assert 0.0 <= task.horizon * task.timestep - duration < subject.timestep
+            left = task.horizon * task.timestep - subject.horizon * subject.timestep
+            assert -1e-9 <= left < subject.timestep - 1e-9, f"{left} s without a planning step"
         else:  # same observations, actions and physics
             assert subject.observation_size == task.observation_size
             assert subject.action_size == task.action_size

@@ -123,7 +123,7 @@ class Moves(Abstraction[PuckState]):
 
     def __init__(self, task: PuckGap) -> None:
         self.task = task
-        self.horizon = round(task.horizon * task.timestep / self.timestep)
+        self.horizon = int(task.horizon * task.timestep / self.timestep + 1e-9)
 
     def start(self, count: int) -> PuckState:
         return PuckState(np.zeros(count), *np.zeros((2, count, 2)))
