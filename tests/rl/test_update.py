@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -161,6 +162,31 @@ def test_both_updates_are_the_same(changes: dict[str, Any]) -> None:
             moved = np.abs(value - before[name]).max()
             assert moved > 0.0
             np.testing.assert_allclose(after[name], value, atol=1e-3 * moved, err_msg=name)
+
+
+def test_the_value_s_gradient_passes_within_the_clip() -> None:
+    """There the clipped error is the error but for rounding, which must not decide."""
+    settings = replace(SMALL, clip_value=True, update="numpy")
+    subject = Subject(settings)
+    update = make_update(subject.actor, subject.critic, subject.storage, settings)
+    assert isinstance(update, NumpyUpdate)
+    rng = np.random.default_rng(0)
+    now, share = rng.uniform(-1.0, 1.0, (2, 1000, 1)).astype(np.float32)
+    error = (rng.choice([-1.0, 1.0], now.shape) * rng.uniform(0.5, 1.0, now.shape)).astype(
+        now.dtype
+    )
+    change, far = np.float32(0.9 * settings.clip) * share, np.float32(0.4) * np.sign(error)
+    passed: list[np.ndarray] = []
+    update._value = SimpleNamespace(  # type: ignore[assignment]
+        forward=lambda _: now, backward=passed.append, step=lambda _: None
+    )
+    update._update_value(now, now - error, now - change)
+    np.testing.assert_allclose(passed[0], 2.0 * error / len(error), rtol=1e-3, atol=1e-8)
+    # Beyond the range it passes only where the clipped error is the smaller one.
+    update._update_value(now, now - error, now - far)
+    np.testing.assert_allclose(passed[1], passed[0])
+    update._update_value(now, now - error, now + far)
+    np.testing.assert_array_equal(passed[2], 0.0)
 
 
 def test_rsl_rls_update_is_its_ppo() -> None:

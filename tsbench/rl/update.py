@@ -411,7 +411,9 @@ class NumpyUpdate:
             change = now - values
             bounded = values + np.clip(change, -s.clip, s.clip) - returns
             worse = bounded * bounded
-            error = np.where(worse > square, np.float32(0.0), error)
+            # Within the range both are equal but for rounding, and the gradient passes.
+            stuck = (np.abs(change) > s.clip) & (worse > square)
+            error = np.where(stuck, np.float32(0.0), error)
             square = np.maximum(square, worse)
         self._value.backward(error * np.float32(2.0 * s.value_weight / len(error)))
         self._value.step(self.learning_rate)
