@@ -27,7 +27,7 @@ from tsbench.sim.agreement import (
     whole_episode_gaps,
 )
 from tsbench.sim.change import Change
-from tsbench.sim.disturbed import Disturbances
+from tsbench.sim.disturbed import Disturbances, physics_factors, variants
 from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push
 from tsbench.testing.episodes import one_of_each_kind
@@ -37,7 +37,7 @@ pytest.importorskip("mujoco_warp", reason="needs the extra: tsbench[gpu]")
 import torch
 
 from tsbench.sim.device import DeviceEnvironment
-from tsbench.sim.warp import HostPhysics, WarpPhysics, Worlds, capacity, physics_factors, variants
+from tsbench.sim.warp import HostPhysics, WarpPhysics, Worlds, capacity
 
 pytestmark = pytest.mark.warp
 

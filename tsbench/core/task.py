@@ -451,9 +451,9 @@ def roadmap_space(task: MDP[S], method: str) -> RoadmapSpace[S]:
     """The points that a roadmap of the task joins.
 
     Raises:
-        TsbenchError: the task has none, so that the method cannot do it.
+        TsbenchError: the task has none, so that the method cannot do it, or no planning variant.
     """
-    space = task.abstraction().roadmap_space() if isinstance(task, Plannable) else None
+    space = plannable(task).abstraction().roadmap_space()
     if space is None:
         raise TsbenchError(f"the method {method} cannot do {task.name}: it has no roadmap space")
     return space

@@ -16,8 +16,8 @@ from tsbench.core.motion import Plan
 from tsbench.core.policy import Policy
 from tsbench.methods import options, planned_task
 from tsbench.rl.stages import AFTER_IMITATION, ImitationOptions, learn_imitation, learn_planning
-from tsbench.sim.episodes import PolicyFunction, play
-from tsbench.sim.kinematic import Planning
+from tsbench.sim.episodes import PolicyFunction
+from tsbench.sim.kinematic import Planning, rolled_out
 
 STAGES = ("plan", "imitate", *AFTER_IMITATION)
 
@@ -48,13 +48,4 @@ def train(problem: Problem, workspace: Workspace) -> Policy:
 
 def extract(planning: Planning[Any], policy: PolicyFunction) -> Plan:
     """The plan: one deterministic episode of the planner."""
-    episode = play(planning, planning, policy, 1, seed=0, record=planning.abstraction.flatten)
-    length = int(episode.lengths[0])
-    assert episode.states is not None
-    return Plan(
-        task=planning.name,
-        task_version=planning.version,
-        timestep=planning.timestep,
-        states=episode.states[: length + 1, 0],
-        rewards=episode.rewards[:length, 0],
-    )
+    return rolled_out(planning.task, lambda state, _: policy(planning.observation(state)))

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from tsbench.core.arrays import Array
@@ -63,6 +64,24 @@ class Disturbances:
                 raise ValueError(f"{name} must lie in [0, 1), not {getattr(self, name)}")
 
 
+def physics_factors(disturbances: Disturbances, rng: Rng, count: int) -> np.ndarray:
+    """Factors of mass, friction and strength, shape (count, 3); none where nothing disturbs
+    them."""
+    bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
+    if not any(bounds):
+        return np.ones((0, 3))
+    factors: np.ndarray = 1.0 + rng.uniform(-1.0, 1.0, (count, 3)) * bounds
+    return factors
+
+
+def variants(model: mujoco.MjModel, factors: np.ndarray) -> list[mujoco.MjModel]:
+    """Models with other mass, friction and strength, one for each row of `factors` (p, 3)."""
+    models = [copy.copy(model) for _ in factors]
+    for one, (mass, friction, strength) in zip(models, factors, strict=True):
+        Change(mass, friction, strength).apply(one)
+    return models
+
+
 class DisturbedPhysics(Physics[S]):
     """Full physics under disturbances.
 
@@ -88,14 +107,9 @@ class DisturbedPhysics(Physics[S]):
         self._actions = np.zeros(
             (count, disturbances.latency + 1, task.action_size)
         )  # newest first
-        rng = np.random.default_rng(seed)
-        bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
-        self._factors: np.ndarray | None = None
-        if any(bounds):
-            self._factors = 1.0 + rng.uniform(-1.0, 1.0, (count, 3)) * bounds
-            self._models = [copy.copy(self.batch.model) for _ in range(count)]
-            for model, (mass, friction, strength) in zip(self._models, self._factors, strict=True):
-                Change(mass, friction, strength).apply(model)
+        self._factors = physics_factors(disturbances, np.random.default_rng(seed), count)
+        if len(self._factors):
+            self._models = variants(self.batch.model, self._factors)
             self.batch.set_models(self._models)
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
@@ -119,7 +133,7 @@ class DisturbedPhysics(Physics[S]):
         """Factors of mass, friction and motor strength, and the latency in control steps, where
         they are disturbed. How well an episode goes hangs on them, so a critic that does not know
         them takes them for merits of the actions."""
-        factors = () if self._factors is None else tuple(self._factors.T)
+        factors = tuple(self._factors.T) if len(self._factors) else ()
         return (*factors, self._latency) if self.disturbances.latency else factors
 
     def _draw(self, rng: Rng, rows: np.ndarray) -> None:

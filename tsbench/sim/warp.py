@@ -16,7 +16,6 @@ times as much (H200, 8,192 worlds).
 
 from __future__ import annotations
 
-import copy
 import gc
 import math
 from collections.abc import Mapping, Sequence
@@ -33,7 +32,7 @@ from tsbench.core.state import Readings, Rng, S, Start
 from tsbench.core.task import SimulatedTask
 from tsbench.sim.change import Change
 from tsbench.sim.device import Replayed, merged
-from tsbench.sim.disturbed import Disturbances
+from tsbench.sim.disturbed import Disturbances, physics_factors, variants
 from tsbench.sim.model import sensor_slices
 from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push
@@ -537,7 +536,7 @@ class WarpPhysics(Generic[S]):
         self._substeps = self.plant.substeps * (change or Change()).refine
         model = _model(task, change)
         rng = np.random.default_rng(seed)
-        factors = physics_factors(disturbances, rng, count)
+        factors = physics_factors(disturbances, rng, min(count, PHYSICS))
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
         self.worlds = Worlds(
             model,
@@ -859,21 +858,3 @@ def _model(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
     model = spec.compile()
     (change or Change()).apply(model)
     return model
-
-
-def physics_factors(disturbances: Disturbances, rng: Rng, count: int) -> np.ndarray:
-    """Factors of mass, friction and strength, shape (p, 3), p at most `count` and `PHYSICS`; none
-    where nothing disturbs them."""
-    bounds = [disturbances.mass, disturbances.friction, disturbances.strength]
-    if not any(bounds):
-        return np.ones((0, 3))
-    factors: np.ndarray = 1.0 + rng.uniform(-1.0, 1.0, (min(count, PHYSICS), 3)) * bounds
-    return factors
-
-
-def variants(model: mujoco.MjModel, factors: np.ndarray) -> list[mujoco.MjModel]:
-    """Models with other mass, friction and strength, one for each row of `factors` (p, 3)."""
-    models = [copy.copy(model) for _ in factors]
-    for one, (mass, friction, strength) in zip(models, factors, strict=True):
-        Change(mass, friction, strength).apply(one)
-    return models

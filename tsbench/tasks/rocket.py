@@ -59,6 +59,7 @@ class Constants:
 
 
 C = Constants()
+CLEARANCE = C.obstacle_radius + C.hull_radius  # m, of an upright or tilted rocket from a centre
 
 # The paper prints degrees; spec section 1 says why this is in radians.
 PLAN_TURN = 0.05  # rad per plan step (P, unit D)
@@ -358,8 +359,7 @@ class Rocket(Plannable[RocketState]):
         """A state at rest at positions (..., 2), its clearance that of a disc around the hull."""
         xp = array_namespace(position)
         clearance = [
-            norm(position - like(position, obstacle))[..., None]
-            - (C.obstacle_radius + C.hull_radius)
+            norm(position - like(position, obstacle))[..., None] - CLEARANCE
             for obstacle in self.obstacles
         ]
         return RocketState(
@@ -389,6 +389,7 @@ class Rocket(Plannable[RocketState]):
         )
 
     def audit(self, plan: Plan, reference: ReferenceMotion) -> Audit:
+        """The clearance is that of the plan's states; between two of them it may be 1.3 cm less."""
         path = plan.states[:, :2]
         final = float(np.linalg.norm(path[-1] - self.goal))
         speed = float(np.abs(np.diff(path, axis=0)).max() / plan.timestep)
@@ -401,7 +402,7 @@ class Rocket(Plannable[RocketState]):
         ]
         for number, obstacle in enumerate(self.obstacles, 1):
             nearest = float(np.linalg.norm(path - np.array(obstacle), axis=-1).min())
-            shortfall = max(0.0, C.obstacle_radius + C.hull_radius - nearest)
+            shortfall = max(0.0, CLEARANCE - nearest)
             items.append(
                 AuditItem(f"missing clearance from obstacle {number}", shortfall, 0.0, "m")
             )
@@ -492,7 +493,7 @@ class RocketSpace(DrivableSpace[RocketState]):
         clear = np.ones(len(first), bool)
         for obstacle in self.obstacles:
             distance = segment_distance(obstacle, first, second)
-            clear &= distance >= C.obstacle_radius + C.hull_radius + ROADMAP_SLACK
+            clear &= distance >= CLEARANCE + ROADMAP_SLACK
         return clear
 
     def action(self, state: RocketState, point: np.ndarray) -> np.ndarray:
