@@ -159,7 +159,7 @@ def test_too_little_room_is_an_error(too_little: dict[str, Any]) -> None:
     physics.check()
     physics.worlds.qpos[:, 2] = 0.3  # feet and knees in the floor
     physics.advance(state, torch.zeros(2, 12))
-    with pytest.raises(TsbenchError, match=r"the physics ran out of room .* a world: allow more"):
+    with pytest.raises(TsbenchError, match=r"the physics ran out of room .* a world: let fewer"):
         physics.check()
 
 

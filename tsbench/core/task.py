@@ -70,7 +70,13 @@ class MDP(ABC, Generic[S]):
 
     @abstractmethod
     def reward(self, previous: S, action: Array, state: S) -> Array:
-        """Reward of the step from `previous` to `state`, shape (...,)."""
+        """Reward of the step from `previous` to `state`, shape (...,).
+
+        The planning variant has this reward too, and gives it the planner's action: a change of the
+        state, of another size than an action of the task. A plan or reference motion is valued with
+        actions of zero. So a term that depends on the action, such as a cost of torques, means
+        something else there.
+        """
 
     @abstractmethod
     def terminal(self, state: S) -> Array:
@@ -255,9 +261,11 @@ class Task(SimulatedTask[S], Plant[S]):
 
     @abstractmethod
     def constants(self) -> Mapping[str, Any]:
-        """Every value that decides a score and does not stand in the MJCF, by name: numbers,
-        strings, and lists or mappings of them. Scores made with different values are not
-        comparable, so values that matter only to a learner are left out."""
+        """The values that decide a score and do not stand in the MJCF, by name: numbers, strings,
+        and lists or mappings of them. Scores made with different values are not comparable, so
+        values that matter only to a learner are left out. Their hash is what tells one task's
+        scores from another's: a value that decides a score and is left out, such as Laikago's
+        least number of cycles, must stay as it is within a `version`."""
 
 
 class Abstraction(ABC, Generic[S]):

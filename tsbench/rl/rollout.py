@@ -63,7 +63,8 @@ class Rollout:
     ) -> None:
         """Stores the results of the actions; all tensors have shape (environments,). Where
         `time_outs` in `extras` is one, the episode ended by its last step, and the discounted value
-        of its last observation is added to the reward."""
+        of the observation that its last action was chosen on is added to the reward, as rsl-rl
+        does."""
         step = self._step
         step.rewards = rewards.clone()
         step.dones = dones

@@ -47,8 +47,8 @@ class PPOSettings:
     final_std: bound on the standard deviation at the end of a stage; the bound falls geometrically
         from `initial_std`. None for no bound. If actions have dead zones, a policy can come to
         depend on its own noise, and its mean action alone then fails.
-    bootstrap: whether the value of the last observation is added to the reward when an episode ends
-        by its last step.
+    bootstrap: whether a value is added to the reward when an episode ends by its last step: as in
+        rsl-rl that of the observation on which the last action was chosen, `repeat` steps before.
     update: which update learns from the collected steps, a name in `UPDATES`.
     optimizer: a name in `OPTIMIZERS`.
     minibatch_advantages: whether advantages are normalised within each minibatch, instead of over

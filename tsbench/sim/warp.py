@@ -342,7 +342,7 @@ class Worlds:
             raise TsbenchError(
                 f"the physics ran out of room ({mjw.OverflowType(found)!r}) for "
                 f"{self._d.naconmax // self._d.nworld} contacts and {self._d.njmax} constraints a "
-                "world: allow more"
+                "world: let fewer geoms touch in the model, or take C MuJoCo (device=cpu)"
             )
 
     def _stream(self) -> Any:

@@ -33,8 +33,9 @@ from tsbench.sim.tracking import deepmimic_reward
 from tsbench.tasks import register
 
 FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
-# Cycles of the gait before which an arrival has not shown it (D). They decide verdicts and no
-# reward, so they are none of the constants whose hash tells a policy's task.
+# Cycles of the gait before which an arrival has not shown it (D). They decide which episodes are
+# solved, and no reward. They are none of `Task.constants`, whose hash the kept entries have, so
+# another number needs another version of the tasks.
 LEAST_CYCLES = 2
 
 
