@@ -162,6 +162,8 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
             ["run", TASK, "task.training.imitate.disturb={interval: 1e-9, duration: 1e-9}"],
             "task.training.imitate.disturb.interval must be at least a control step of 0.02 s",
         ),
+        (["verify", "--all", "--quick", "--retrain"], "--quick makes no score again"),
+        (["verify", "--all", "--quick", "--seed-file", "x"], "--quick makes no score again"),
         (["evaluate", ".", "--trust-sb3", "PPO"], "--trust-sb3 is for a stable-baselines3 .zip"),
         (["run", TASK, "task.constants.distanse=1"], "(did you mean 'distance'?)"),
         (["run", TASK, "task.training.plan.cilp=1"], "(did you mean 'clip'?)"),

@@ -157,10 +157,55 @@ def test_an_entry_is_verified_in_full_and_the_verdict_kept(
     kept = verify.recorded(Path("board"), ENTRY)
     assert kept is not None
     assert (kept.state, kept.reasons) == ("retracted", ("retracted: a bug",))
+    assert cli.main(["verify", "--all", "--board", "board", "--record"]) == 0
+    assert f"{ENTRY} stays retracted" in capsys.readouterr().out
+    assert verify.recorded(Path("board"), ENTRY) == kept
     # Another entry under that name has no verdict yet.
     shutil.rmtree(ENTRY)
     assert submit("one", "--hardware", "another") == 0
     assert verify.recorded(Path("board"), ENTRY) is None
+
+
+def test_a_kept_verdict_is_replaced_by_a_higher_state_or_a_failure(finished: Path) -> None:
+    assert submit("one") == 0
+    board = Path("board")
+    first = verify.verify(ENTRY, verify.Asked(rescore=False))
+    for state, passed, written in (
+        ("re-scored", True, True),
+        ("replayed", True, False),
+        ("re-trained", True, True),
+        ("hidden-seed", True, False),
+        ("submitted", False, True),
+        ("replayed", True, True),
+        ("retracted", False, True),
+        ("submitted", False, False),
+        ("re-trained", True, False),
+    ):
+        before = verify.recorded(board, ENTRY)
+        verdict = replace(first, state=state, passed=passed)
+        assert (verify.record(board, ENTRY, verdict) is not None) is written, state
+        assert verify.recorded(board, ENTRY) == (verdict if written else before)
+    # On other files it says nothing.
+    other = replace(first, digest="0" * 64)
+    (board / "verdicts/quick/rocket_navigation/mine.json").write_text(
+        json.dumps(verify.plain(replace(other, state="re-trained")))
+    )
+    assert verify.record(board, ENTRY, first) is not None
+
+
+def test_a_board_keeps_verdicts_on_its_own_entries_alone(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert submit("one") == 0
+    shutil.copytree("board", "elsewhere")
+    other = str("elsewhere" / ENTRY.relative_to("board"))
+    for words in (["--record", "--quick"], ["--retract", "a bug"]):
+        assert cli.main(["verify", other, "--board", "board", *words]) == 2
+        assert f"{other} does not lie in board/v1/TASK" in capsys.readouterr().err
+    assert not Path("board/verdicts").exists()
+    linked = f"board/../{ENTRY}"  # the same place by another path
+    assert cli.main(["verify", linked, "--board", "board", "--record", "--quick"]) == 0
+    assert verify.recorded(Path("board"), ENTRY) is not None
 
 
 def test_a_check_keeps_nothing(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -608,6 +653,21 @@ def test_training_again(finished: Path, capsys: pytest.CaptureFixture[str]) -> N
         patch.setattr(execute, "SMOKE", QUICK)
         assert cli.main(["verify", str(ENTRY), "--retrain"]) == 0
     assert "re-trained: seed3 was trained again to the same bits" in capsys.readouterr().out
+
+
+def test_training_again_uses_nothing_of_its_author_s_machine(finished: Path) -> None:
+    """A logger would write into the verifier's account, or fail without its package."""
+    other_config(finished, "- tensorboard", "- wandb")
+    other_config(finished, "checkpoint: 30.0", "checkpoint: 0.0")
+    assert submit("one") == 0
+    asked = []
+
+    def train(chosen: config.RunConfig) -> None:
+        asked.append(chosen)
+        raise TsbenchError("enough")
+
+    verify.verify(ENTRY, verify.Asked(rescore=False, train=train))
+    assert [(one.loggers, one.checkpoint) for one in asked] == [((), 30.0)]
 
 
 def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]) -> None:

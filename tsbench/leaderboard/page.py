@@ -146,7 +146,7 @@ def tables(board: Path) -> tuple[list[Table], list[str]]:
             left_out.append(str(error))
             continue
         verdict = recorded(board, path)
-        state = verdict.state if verdict and verdict.state else STATES[0]
+        state = verdict.state if verdict else STATES[0]
         reasons = verdict.reasons if verdict else ("no verdict is recorded",)
         if state == RETRACTED:
             left_out.append(f"{entry.name}: {'; '.join(reasons)}")

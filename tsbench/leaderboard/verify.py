@@ -1,6 +1,6 @@
 """Verification: what is found out about an entry from its files alone, with the code of today.
 
-Every state includes those before it:
+Every state includes those before it, but *re-trained*, which can be reached without *hidden-seed*:
 
 - *submitted*: the files are whole and belong together (`submission.read_entry`);
 - *replayed*: the kept actions earn the kept rewards again, which takes seconds;
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from tsbench.core.errors import TsbenchError, os_errors, plain_line
+from tsbench.core.errors import TsbenchError, os_errors, plain_line, quoted
 from tsbench.core.files import read_file, read_json, write_whole
 from tsbench.core.typed import typed
 from tsbench.evaluation.evaluate import evaluate, solved_rewards
@@ -36,7 +36,7 @@ from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.evaluation.replay import compare, incomparable, replay
 from tsbench.evaluation.score import Score
-from tsbench.leaderboard.submission import MANIFEST, Claim, Entry, Kept, read_entry
+from tsbench.leaderboard.submission import Claim, Entry, Kept, read_entry, read_manifest
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.schema import RunConfig
 
@@ -272,7 +272,17 @@ def _retrain(kept: Kept, asked: Asked, findings: _Findings) -> tuple[bool, str]:
     assert asked.train is not None
     with tempfile.TemporaryDirectory(prefix="tsbench-retrain-") as folder:
         place = f"{folder}/run"
-        asked.train(replace(kept.run.config(), directory=place, threads=asked.threads))
+        # Loggers and checkpoints are its author's: they change no result, and a logger writes into
+        # the account of whoever verifies.
+        asked.train(
+            replace(
+                kept.run.config(),
+                directory=place,
+                threads=asked.threads,
+                loggers=(),
+                checkpoint=RunConfig.checkpoint,
+            )
+        )
         run = RunDirectory(Path(place))
         same = run.policy().sha256 == kept.policy.sha256
         found = run.record().score.solved_reward
@@ -310,12 +320,13 @@ def hidden_seed(file: Path, board: Path) -> int:
 
 
 def recorded(board: Path, entry: Path) -> Verdict | None:
-    """What the board says of an entry, if it speaks of these files.
+    """What the board says of an entry, if it speaks of these files. None if it does not, or if the
+    entry has no manifest that can be read.
 
     Raises:
         TsbenchError: the verdict is damaged.
     """
-    path = _place(board, entry)
+    path = place(board, entry)
     if not path.exists():
         return None
     content = read_json(path, MAX_VERDICT, "verdict")
@@ -323,21 +334,62 @@ def recorded(board: Path, entry: Path) -> Verdict | None:
         verdict: Verdict = typed(Verdict, content, "")
     except TsbenchError as error:
         raise TsbenchError(f"damaged verdict {path}: {error}") from None
-    manifest = read_json(entry / MANIFEST, MAX_VERDICT, "manifest")
-    return verdict if manifest.get("digest") == verdict.digest else None
+    if verdict.state not in (*STATES, RETRACTED):
+        raise TsbenchError(f"damaged verdict {path}: there is no state {quoted(verdict.state)}")
+    try:
+        same = read_manifest(entry).digest == verdict.digest
+    except TsbenchError:
+        return None
+    return verdict if same else None
 
 
-def record(board: Path, entry: Path, verdict: Verdict) -> Path:
-    """Writes what the board says of an entry from now on.
+def is_retracted(board: Path, entry: Path) -> bool:
+    """Whether the board has taken these files of an entry back.
 
     Raises:
-        TsbenchError: the file cannot be written.
+        TsbenchError: the verdict is damaged.
     """
-    path = _place(board, entry)
+    verdict = recorded(board, entry)
+    return verdict is not None and verdict.state == RETRACTED
+
+
+def check_lies_on(board: Path, entry: Path) -> None:
+    """Checks that a board's verdicts can be about an entry.
+
+    Raises:
+        TsbenchError: the entry lies elsewhere than on the board.
+    """
+    if entry.resolve().parents[2:3] != (board.resolve(),):
+        raise TsbenchError(
+            f"{entry} does not lie in {board}/v1/TASK, and a board keeps verdicts on its own "
+            "entries alone: --board names another"
+        )
+
+
+def record(board: Path, entry: Path, verdict: Verdict) -> Path | None:
+    """Writes what the board says of an entry from now on. What it said of the same files stays, and
+    nothing is written, unless the verdict is a higher state or one that did not pass.
+
+    Returns:
+        The file that was written, or None.
+
+    Raises:
+        TsbenchError: the file cannot be written, or holds a damaged verdict.
+    """
+    before = recorded(board, entry)
+    if before is not None and not _replaces(verdict, before):
+        return None
+    path = place(board, entry)
     with os_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, (json.dumps(plain(verdict), indent=1) + "\n").encode())
     return path
+
+
+def _replaces(verdict: Verdict, before: Verdict) -> bool:
+    if RETRACTED in (verdict.state, before.state):
+        return verdict.state == RETRACTED
+    return not verdict.passed or STATES.index(verdict.state) > STATES.index(before.state)
 
 
 def plain(verdict: Verdict) -> dict[str, Any]:
@@ -358,8 +410,9 @@ def retracted(path: Path, reason: str) -> Verdict:
     return Verdict(entry.name, entry.manifest.digest, RETRACTED, False, reasons, (), 0.0)
 
 
-def _place(board: Path, entry: Path) -> Path:
-    where = entry.absolute()
+def place(board: Path, entry: Path) -> Path:
+    """The file of a board's verdict on an entry."""
+    where = entry.resolve()
     name = f"{where.name}.json"
     return board / "verdicts" / where.parent.parent.name / where.parent.name / name
 

@@ -32,6 +32,8 @@ def call(words: Sequence[str]) -> int:
     options = parser.parse_args(words)
     if sum((bool(options.entries), options.all, options.pull_request is not None)) != 1:
         parser.error("one of ENTRY, --all and --pull-request BASE is needed")
+    if options.quick and (options.seed_file or options.retrain):
+        parser.error("--quick makes no score again, which --seed-file and --retrain build on")
     from rich.console import Console
 
     from tsbench.core.files import write_json, write_new
@@ -60,15 +62,24 @@ def call(words: Sequence[str]) -> int:
     verdicts = []
     for fault in faults:
         console.print(f"refused: {fault}", markup=False, highlight=False, soft_wrap=True)
-    for entry in () if faults else entries:
+    entries = [] if faults else entries
+    for entry in entries if written else ():
+        verify.check_lies_on(board, entry)
+    for entry in entries:
         if options.retract is not None:
             verdict = verify.retracted(entry, options.retract)
+        elif options.record and verify.is_retracted(board, entry):
+            line = f"{entry} stays retracted, as {verify.place(board, entry)} says"
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+            continue
         else:
             verdict = verify.verify(entry, asked, tell(Console(stderr=True)))
         show_verdict(console, verdict)
         verdicts.append(verdict)
         if verdict.digest and written:
-            sys.stdout.write(f"{verify.record(board, entry, verdict)}\n")
+            place = verify.record(board, entry, verdict)
+            kept = f"kept as it is: {verify.place(board, entry)} says as much or more"
+            sys.stdout.write(f"{place or kept}\n")
     if options.comment:
         write_new(options.comment, verify.comment(verdicts, faults).encode())
     shown = {"refused": faults, "verdicts": [verify.plain(verdict) for verdict in verdicts]}
