@@ -550,8 +550,61 @@ def test_what_a_run_says_itself_is_not_told_again(
     assert "one is a run of tsbench, which says its own seed" in capsys.readouterr().err
     bare("metrics.jsonl")(finished)  # with a score, but no configuration
     assert submit("one", *words) == 2
-    assert "one is a run of tsbench, which says its own seed" in capsys.readouterr().err
+    line = "one/score.json says seed 3, --seeds says 5" if words == TOLD else "given together or"
+    assert line in capsys.readouterr().err
     assert not Path("board").exists()
+
+
+def test_a_training_of_a_kept_entry_of_others_keeps_its_recipe(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare("metrics.jsonl")(finished)
+    assert submit("one") == 2
+    assert "one has no config.yaml, so nothing says what trained it" in capsys.readouterr().err
+    assert submit("one", "--seeds", "3", *TOLD[2:], "--code", "c0de") == 0
+    second = Path("second")
+    shutil.copytree(finished, second)
+    other_score(second, "seed", value=4)
+    more = ["--seeds", "3,4", *TOLD[2:6], "--command", "python other.py"]
+    again = str(ENTRY / "seed3")
+    assert cli.main(["submit", again, str(second), *more, *WHO, "--name", "both"]) == 0
+    first, other = submission.read_manifest(ENTRY.with_name("both")).trainings
+    assert (first.command, first.code) == ("python train.py", "c0de")
+    assert (other.command, other.code) == ("python other.py", None)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["one"], "mine exists and nothing is overwritten: give another --name"),
+        (["one", "one"], "two of the runs have the same seed, 3"),
+        (["one", "other"], "more than one method: mine, twostage"),
+        (["one", "--trained", "4"], "seeds_trained lacks the kept seed 3"),
+        (["bare", *TOLD[:4], "--seconds", "-1", *TOLD[6:]], "seconds must lie between 0 and"),
+        (["bare", *TOLD[:6], "--command", ""], "command must be one line of 1 to"),
+    ],
+)
+def test_what_cannot_be_submitted_is_told_before_a_score_is_made(
+    words: list[str],
+    line: str,
+    finished: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def score(*_: object, **__: object) -> None:
+        raise AssertionError("minutes are spent")
+
+    monkeypatch.setattr("tsbench.evaluation.evaluate.evaluate", score)
+    other_score(finished, "score", "protocol", value="smoke")
+    shutil.copytree("one", "other")
+    other_score(Path("other"), "method", value="mine")
+    other_score(Path("other"), "seed", value=4)
+    shutil.copytree("one", "bare")
+    bare("score.json")(Path("bare"))
+    if words == ["one"]:
+        ENTRY.mkdir(parents=True)
+    assert submit(*words) == 2
+    assert line in capsys.readouterr().err
 
 
 def test_a_board_that_cannot_be_made(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,6 +25,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,8 @@ MAX_TRAININGS = 100
 MAX_ENTRY = 128 * 2**20  # bytes of all files together
 MAX_TEXT = 4000  # characters of a text in the manifest; a recipe may be a long command
 MAX_COUNT = 2**53  # steps
+ALIKE = ("task", "method", "budget", "task_version")  # what all runs of an entry share
+FOREIGN = "--seeds, --steps, --seconds and --command"  # what is told of others' trainings
 MADE = "an entry is what tsbench submit has made of runs, unchanged"
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.+-]{0,63}")
@@ -119,9 +122,9 @@ class Training:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < SEEDS:
             raise ValueError(f"seed must lie between 0 and {SEEDS - 1}, not {self.seed}")
-        for name in ("steps", "physics_substeps", "seconds"):
-            if not 0 <= getattr(self, name) < MAX_COUNT:
-                raise ValueError(f"{name} must lie between 0 and 2**53, not {getattr(self, name)}")
+        _check_counts(
+            steps=self.steps, physics_substeps=self.physics_substeps, seconds=self.seconds
+        )
         _check_texts(command=self.command, code=self.code, **self.versions)
 
     @property
@@ -217,13 +220,7 @@ class Manifest:
         if self.schema != SCHEMA:
             raise ValueError(f"schema is {self.schema}; this tsbench reads {SCHEMA}")
         _check_texts(task=self.task, protocol=self.protocol, method=self.method, budget=self.budget)
-        seeds = [training.seed for training in self.trainings]
-        if not 1 <= len(seeds) <= MAX_TRAININGS or seeds != sorted(set(seeds)):
-            raise ValueError(f"trainings must be 1 to {MAX_TRAININGS}, by rising seed")
-        if lacking := sorted(set(seeds) - set(self.described.seeds_trained)):
-            raise ValueError(
-                f"described.seeds_trained lacks the kept seed {lacking[0]}: say --trained"
-            )
+        _check_seeds([training.seed for training in self.trainings], self.described)
         folders = {training.folder for training in self.trainings}
         for path in self.files:
             if not FILE.fullmatch(path) or path.partition("/")[0] not in folders:
@@ -259,6 +256,19 @@ class Manifest:
         if manifest.encode() != content:
             raise ValueError(f"its digest or its form is another: {MADE}")
         return manifest
+
+
+def _check_seeds(seeds: Sequence[int], described: Described) -> None:
+    if not 1 <= len(seeds) <= MAX_TRAININGS or list(seeds) != sorted(set(seeds)):
+        raise ValueError(f"trainings must be 1 to {MAX_TRAININGS}, by rising seed")
+    if lacking := sorted(set(seeds) - set(described.seeds_trained)):
+        raise ValueError(f"described.seeds_trained lacks the kept seed {lacking[0]}: say --trained")
+
+
+def _check_counts(**counts: float) -> None:
+    for name, value in counts.items():
+        if not 0 <= value < MAX_COUNT:
+            raise ValueError(f"{name} must lie between 0 and 2**53, not {value}")
 
 
 def _check_texts(**texts: str | None) -> None:
@@ -542,13 +552,13 @@ def _remarks(run: RunDirectory, task: Task[Any]) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Told:
-    """What is told of trainings that tsbench did not make, whose directories do not say it.
+    """What is told of trainings that tsbench did not make, where their directories do not say it.
 
     Attributes:
         seeds: one for each directory.
         command: that made them, in words.
-        steps: environment steps of each.
-        seconds: wall-clock time of each.
+        steps: environment steps of each that has no score.
+        seconds: wall-clock time of each that has no score.
         code: git commit of the code that trained them, or None.
         budget: its name.
     """
@@ -559,6 +569,10 @@ class Told:
     seconds: float
     code: str | None = None
     budget: str = "own"
+
+    def __post_init__(self) -> None:
+        _check_counts(steps=self.steps, seconds=self.seconds)
+        _check_texts(command=self.command, code=self.code)
 
 
 Scorer = Callable[[Policy, Task[Any]], Score]
@@ -576,6 +590,8 @@ def pack(
     tell: Callable[[str], None] = lambda line: None,
 ) -> Path:
     """Packs runs into an entry outside of the board, and checks the packed files (`read_entry`).
+
+    What the files say is checked before the first score is made, which takes minutes.
 
     Args:
         runs: directories, of runs or of exported policies.
@@ -610,13 +626,21 @@ def pack(
             parts = []
             for i, run in enumerate(runs):
                 copies[folder / str(i)] = run
-                part = _pack_run(
-                    RunDirectory(run), folder / str(i), protocol, told, i, score, rescore, tell
-                )
+                part = _copied(RunDirectory(run), folder / str(i), protocol, told, i, rescore)
                 parts.append(part)
-                record = part[1]
-                copies[folder / record.task / described.entry / f"seed{record.seed}"] = run
-            return _pack_entry(parts, described, folder, protocol, told)
+                copies[folder / part.task / described.entry / part.name] = run
+            parts.sort(key=lambda part: part.seed)
+            seeds = tuple(part.seed for part in parts)
+            _check_parts(parts)
+            described = replace(described, seeds_trained=described.seeds_trained or seeds)
+            try:
+                _check_seeds(seeds, described)
+            except ValueError as error:
+                raise TsbenchError(f"no entry can be made: {error}") from None
+            entry = board / protocol.name / parts[0].task / described.entry
+            _check_free(entry, [part.name for part in parts], runs)
+            records = [_scored(part, protocol, score, tell) for part in parts]
+            return _pack_entry(parts, records, described, folder, protocol)
     except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, TsbenchError):
@@ -644,12 +668,10 @@ def home(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) -> 
             an entry keeps of them.
     """
     place = board / protocol.name / entry.parent.name / entry.name
+    names = _trainings(entry)
     with os_errors(place):
-        if not _lie_in(place, entry, runs):
-            check_new(place, "give another --name", parents=True)
-            return place
-        check_new(place / MANIFEST)
-        for name in read_manifest(entry).files:
+        _check_free(place, names, runs)
+        for name in read_manifest(entry).files if _lie_in(place, names, runs) else ():
             if (place / name).read_bytes() != (entry / name).read_bytes():
                 reason = "is not what an entry keeps of it: submit the run from elsewhere"
                 raise TsbenchError(f"{place / name} {reason}")
@@ -666,7 +688,7 @@ def place(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) ->
     """
     there = home(entry, board, protocol, runs)
     with os_errors(there):
-        if _lie_in(there, entry, runs):
+        if _lie_in(there, _trainings(entry), runs):
             write_new(there / MANIFEST, (entry / MANIFEST).read_bytes())
         else:
             there.parent.mkdir(parents=True, exist_ok=True)
@@ -675,23 +697,72 @@ def place(entry: Path, board: Path, protocol: Protocol, runs: Sequence[Path]) ->
     return there
 
 
-def _lie_in(place: Path, entry: Path, runs: Sequence[Path]) -> bool:
-    """Whether the runs are the directories of an entry's trainings in that place already."""
-    folders = {(place / one.name).resolve() for one in entry.iterdir() if one.is_dir()}
+def _check_free(place: Path, names: Sequence[str], runs: Sequence[Path]) -> None:
+    """
+    Raises:
+        TsbenchError: there is an entry in that place already.
+    """
+    if _lie_in(place, names, runs):
+        check_new(place / MANIFEST)
+    else:
+        check_new(place, "give another --name", parents=True)
+
+
+def _lie_in(place: Path, names: Sequence[str], runs: Sequence[Path]) -> bool:
+    """Whether the runs are the trainings of those names in that place already."""
+    folders = {(place / name).resolve() for name in names}
     return place.is_dir() and {run.resolve() for run in runs} == folders
 
 
-def _pack_run(
+def _trainings(entry: Path) -> list[str]:
+    """The names of the directories of an entry that `pack` made."""
+    return [one.name for one in entry.iterdir() if one.is_dir()]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A run on its way into an entry.
+
+    Attributes:
+        run: its directory.
+        copy: the copy of its files, of which the entry is made.
+        before: the content of its `score.json`, or None if it has none.
+        told: what is told of it if it has none.
+        keeps: whether its score stays as it is.
+        task: name of the task, as `method` and `budget` are.
+        task_version: version of the task.
+        command: that made it, in words.
+        code: git commit of the code that trained it, or None.
+    """
+
+    run: Path
+    copy: RunDirectory
+    before: Record | None
+    told: Told | None
+    keeps: bool
+    task: str
+    task_version: int
+    method: str
+    budget: str
+    seed: int
+    command: str
+    code: str | None
+
+    @property
+    def name(self) -> str:
+        """Of its directory in the entry."""
+        return f"seed{self.seed}"
+
+
+def _copied(
     run: RunDirectory,
     folder: Path,
     protocol: Protocol,
     told: Told | None,
     number: int,
-    score: Scorer,
     rescore: bool,
-    tell: Callable[[str], None],
-) -> tuple[Path, Record]:
-    """Copies a run's files, reading each of them once, and makes its score if it has none."""
+) -> _Part:
+    """Copies a run's files, reading each of them once."""
     if not run.policy_info_file.exists():
         raise TsbenchError(_without_policy(run))
     folder.mkdir()
@@ -708,32 +779,93 @@ def _pack_run(
             raise TsbenchError(run.unfinished)
         raise TsbenchError(
             f"{run.path} has no {run.score_file.name}: of a policy that tsbench did not train "
-            "say --seeds, --steps, --seconds and --command"
+            f"say {FOREIGN}"
         )
+    keeps = before is not None and before.score.protocol == protocol.name and not rescore
     if before is not None:
         coherence.check_budget(copy, before)
-    if before is not None and before.score.protocol == protocol.name and not rescore:
-        if not copy.actions_file.exists():
+    if keeps and not copy.actions_file.exists():
+        raise TsbenchError(
+            f"{run.path} has no {run.actions_file.name}: --rescore makes it, with the score"
+        )
+    if before is not None:
+        values: dict[str, Any] = {name: getattr(before, name) for name in ALIKE}
+        seed = before.seed
+        if told is not None and told.seeds[number] != seed:
             raise TsbenchError(
-                f"{run.path} has no {run.actions_file.name}: --rescore makes it, with the score"
+                f"{run.score_file} says seed {seed}, --seeds says {told.seeds[number]}"
             )
-        return folder, before
+    else:
+        assert told is not None
+        info, seed = copy.policy().info, told.seeds[number]
+        values = {name: getattr(info, name) for name in ALIKE if name != "budget"}
+        values["budget"] = told.budget
+    command, code = _recipe(run, seed, told)
+    if copy.versions_file.exists():
+        code = copy.versions().get("commit")
+    return _Part(
+        run.path, copy, before, told, keeps, **values, seed=seed, command=command, code=code
+    )
+
+
+def _recipe(run: RunDirectory, seed: int, told: Told | None) -> tuple[str, str | None]:
+    """The command that made a run, and the commit of its code: as its configuration says, as the
+    manifest of the entry says in which it lies, or as told."""
+    if run.begun:
+        return run.command, None
+    entry = run.path.resolve().parent
+    if (entry / MANIFEST).exists():
+        for training in read_manifest(entry).trainings:
+            if (training.folder, training.seed) == (run.path.resolve().name, seed):
+                return training.command, training.code
+    if told is None:
+        raise TsbenchError(
+            f"{run.path} has no {run.config_file.name}, so nothing says what trained it: say "
+            f"{FOREIGN}"
+        )
+    return told.command, told.code
+
+
+def _check_parts(parts: Sequence[_Part]) -> None:
+    """
+    Raises:
+        TsbenchError: the runs, by rising seed, cannot be one entry.
+    """
+    for name in ALIKE:
+        values = sorted({str(getattr(part, name)) for part in parts})
+        if len(values) > 1:
+            found = f"{name}: {', '.join(values)}"
+            raise TsbenchError(
+                f"the runs are of more than one {found}; each is an entry of its own"
+            )
+    for one, other in pairwise(parts):
+        if one.seed == other.seed:
+            raise TsbenchError(
+                f"two of the runs have the same seed, {one.seed}: an entry keeps one training of "
+                "each"
+            )
+
+
+def _scored(part: _Part, protocol: Protocol, score: Scorer, tell: Callable[[str], None]) -> Record:
+    """The record of a run, whose score is made if it has none by the protocol."""
+    before, copy = part.before, part.copy
+    if before is not None and part.keeps:
+        return before
     if before is not None and before.score.protocol != protocol.name:
         by = f"its score is by the protocol {before.score.protocol}"
-        tell(f"{run.path}: {by}, so it is scored again by {protocol.name}")
+        tell(f"{part.run}: {by}, so it is scored again by {protocol.name}")
     trained = copy.policy()
     task = copy.task(trained.info.task)
     made = score(trained, task)
     assert made.log is not None
     if before is None:
-        assert told is not None
-        before = _record(told, number, trained, task, made)
+        before = _record(part, task, made)
     for path in (copy.score_file, copy.actions_file):
         path.unlink(missing_ok=True)
     made.log.save(copy.actions_file)
     record = replace(before, score=made)
     write_json(copy.score_file, record.as_dict())
-    return folder, record
+    return record
 
 
 def _without_policy(run: RunDirectory) -> str:
@@ -750,7 +882,9 @@ def _without_policy(run: RunDirectory) -> str:
     return lacking
 
 
-def _record(told: Told, number: int, trained: Policy, task: Task[Any], made: Score) -> Record:
+def _record(part: _Part, task: Task[Any], made: Score) -> Record:
+    told = part.told
+    assert told is not None
     model = task.spec().compile()
     substeps = told.steps * round(task.timestep / model.opt.timestep)
     stage = Stage("train", told.steps, told.steps, substeps, seconds=told.seconds)
@@ -758,51 +892,36 @@ def _record(told: Told, number: int, trained: Policy, task: Task[Any], made: Sco
         task=task.name,
         task_version=task.version,
         standard=tasks.standard(task),
-        method=trained.info.method,
-        seed=told.seeds[number],
-        budget=told.budget,
+        method=part.method,
+        seed=part.seed,
+        budget=part.budget,
         score=made,
         stages=(stage,),
     )
 
 
 def _pack_entry(
-    parts: Sequence[tuple[Path, Record]],
+    parts: Sequence[_Part],
+    records: Sequence[Record],
     described: Described,
     folder: Path,
     protocol: Protocol,
-    told: Told | None,
 ) -> Path:
-    first = parts[0][1]
-    for name in ("task", "method", "budget", "task_version"):
-        values = sorted({str(getattr(record, name)) for _, record in parts})
-        if len(values) > 1:
-            found = f"{name}: {', '.join(values)}"
-            raise TsbenchError(
-                f"the runs are of more than one {found}; each is an entry of its own"
-            )
-    seeds = [record.seed for _, record in parts]
-    if len(set(seeds)) < len(seeds):
-        twice = next(seed for seed in seeds if seeds.count(seed) > 1)
-        raise TsbenchError(
-            f"two of the runs have the same seed, {twice}: an entry keeps one training of each"
-        )
+    first = parts[0]
     entry = folder / first.task / described.entry
     entry.mkdir(parents=True)
     files: dict[str, FileHash] = {}
     trainings = []
-    for source, record in sorted(parts, key=lambda part: part[1].seed):
-        training = _training(RunDirectory(source), record, told)
-        source.rename(entry / training.folder)
+    for part, record in zip(parts, records, strict=True):
+        training = _training(part, record)
+        part.copy.path.rename(entry / training.folder)
         trainings.append(training)
         for path in sorted((entry / training.folder).iterdir()):
             files[f"{training.folder}/{path.name}"] = hash_of(path.read_bytes())
     try:
         manifest = Manifest(
             schema=SCHEMA,
-            described=replace(
-                described, seeds_trained=described.seeds_trained or tuple(sorted(seeds))
-            ),
+            described=described,
             task=first.task,
             task_version=first.task_version,
             protocol=protocol.name,
@@ -818,15 +937,15 @@ def _pack_entry(
     return entry
 
 
-def _training(run: RunDirectory, record: Record, told: Told | None) -> Training:
+def _training(part: _Part, record: Record) -> Training:
+    run = part.copy
     versions: dict[str, Any] = run.versions() if run.versions_file.exists() else {}
     steps, substeps, seconds = cost_of(record)
-    command = run.command if run.config_file.exists() else told.command if told else "unknown"
     try:
         return Training(
             seed=record.seed,
-            command=command,
-            code=versions.get("commit") if versions else told.code if told else None,
+            command=part.command,
+            code=part.code,
             steps=steps,
             physics_substeps=substeps,
             seconds=seconds,

@@ -29,9 +29,10 @@ def call(words: Sequence[str]) -> int:
     flag("--threads", type=threads, metavar="N", help="CPU threads (all)")
     told = parser.add_argument_group("of policies that tsbench did not train")
     told.add_argument("--seeds", type=seeds, metavar="SEEDS", help="one for each RUN, e.g. 0-2")
-    told.add_argument("--steps", type=count, metavar="N", help="environment steps of each")
-    told.add_argument("--seconds", type=float, metavar="S", help="of each training")
-    told.add_argument("--command", metavar="TEXT", help="that trained them")
+    told.add_argument("--steps", type=count, metavar="N", help="environment steps of each that "
+                      "has no score.json")  # fmt: skip
+    told.add_argument("--seconds", type=float, metavar="S", help="of each training without one")
+    told.add_argument("--command", metavar="TEXT", help="that trained those that are in no entry")
     told.add_argument("--code", metavar="COMMIT", help="of the code that trained them")
     options = parser.parse_args(words)
     from rich.console import Console
@@ -57,16 +58,21 @@ def call(words: Sequence[str]) -> int:
     except ValueError as error:
         raise TsbenchError(str(error)) from None
     foreign = (options.seeds, options.steps, options.seconds, options.command)
-    own = [run for run in map(RunDirectory, options.runs) if run.begun or run.finished]
-    if own and any(one is not None for one in (*foreign, options.code)):
-        parser.error(f"{own[0].path} is a run of tsbench, which says its own seed and steps")
-    if None not in foreign and len(options.seeds) != len(options.runs):
-        parser.error(f"{len(options.seeds)} --seeds for {len(options.runs)} runs")
-    given = (
-        submission.Told(tuple(options.seeds), options.command, options.steps, options.seconds,
-                        options.code)
-        if None not in foreign else None
-    )  # fmt: skip
+    if any(one is not None for one in (*foreign, options.code)):
+        if own := [run.path for run in map(RunDirectory, options.runs) if run.begun]:
+            parser.error(f"{own[0]} is a run of tsbench, which says its own seed and steps")
+        if None in foreign:
+            parser.error(f"{submission.FOREIGN} are given together or not at all")
+        if len(options.seeds) != len(options.runs):
+            parser.error(f"{len(options.seeds)} --seeds for {len(options.runs)} runs")
+    given = None
+    if options.command is not None:
+        try:
+            given = submission.Told(
+                tuple(options.seeds), options.command, options.steps, options.seconds, options.code
+            )
+        except ValueError as error:
+            raise TsbenchError(str(error)) from None
 
     def score(policy: Any, task: Any) -> Any:
         with progress_bar(console, "evaluate") as progress:
