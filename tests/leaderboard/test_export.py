@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 from rsl_rl.models import MLPModel, RNNModel
+from sb3_contrib import ARS
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensordict import TensorDict
@@ -121,6 +123,34 @@ def test_an_onnx_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert cli.main(["export", other, f"task={NAME}", f"{out}2", "--method", "mine"]) == 2
     assert "the operation 'Softplus'" in capsys.readouterr().err
     assert not Path(f"{out}2").exists()
+
+
+@pytest.mark.parametrize(
+    ("form", "refused"),
+    [
+        ({"value_float": 0.5}, ""),
+        ({"value_floats": [0.5] * SIZE}, ""),
+        ({"value_string": "x"}, "holds a Constant by value_string; allowed: value, value_float(s)"),
+    ],
+)
+def test_a_constant_of_an_onnx_file(form: dict[str, Any], refused: str, tmp_path: Path) -> None:
+    """ONNX gives a constant as a tensor, or as a number or text of its own."""
+    path = write_onnx(tmp_path / "p.onnx")
+    model = onnx.load(str(path))
+    nodes = [helper.make_node("Constant", [], ["half"], **form), *model.graph.node]
+    if not refused:
+        nodes.insert(1, helper.make_node("Mul", ["x", "half"], ["scaled"]))
+        nodes[2].input[list(nodes[2].input).index("x")] = "scaled"
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    onnx.save(model, str(path))
+    if refused:
+        with pytest.raises(TsbenchError, match=re.escape(refused)):
+            export.read(path, TASK)
+        return
+    policy, _ = export.policy_of(export.read(path, TASK), TASK, "mine")
+    expected = foreign.from_onnx(path, TASK)(OBSERVATIONS)
+    np.testing.assert_allclose(policy(OBSERVATIONS), expected, atol=1e-4)
 
 
 def test_a_state_dict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -233,10 +263,11 @@ def environment() -> gymnasium.Env[Any, Any]:
     return gymnasium.make(tsbench.gym.identifier(NAME))
 
 
-@pytest.mark.parametrize("kind", [PPO, SAC, TD3])
+@pytest.mark.parametrize("kind", [PPO, SAC, TD3, ARS])
 def test_models_of_stable_baselines3(kind: Any) -> None:
     """Squashed or clipped, tanh or relu: as the model answers."""
-    more = {"n_steps": 8, "batch_size": 8} if kind is PPO else {"buffer_size": 8}
+    buffers = {PPO: {"n_steps": 8, "batch_size": 8}, ARS: {}}
+    more = buffers.get(kind, {"buffer_size": 8})
     sizes = {"net_arch": [16, 16]}
     model = kind("MlpPolicy", environment(), seed=0, device="cpu", policy_kwargs=sizes, **more)
     given = foreign.from_sb3_model(model, TASK)

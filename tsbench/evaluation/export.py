@@ -183,9 +183,9 @@ def from_sb3(policy: foreign.ForeignPolicy) -> Found:
         raise TsbenchError("it was trained with state-dependent exploration (use_sde)")
     actor = getattr(net, "actor", None)
     if actor is None:  # PPO and A2C: tanh or what was asked for, actions clipped
-        _add_modules(found, [*_leaves(net.mlp_extractor.policy_net), *_leaves(net.action_net)])
-        if getattr(net, "squash_output", False):
-            found.activate("tanh")
+        shared = getattr(net, "mlp_extractor", None)  # ARS has none: one network, perhaps squashed
+        hidden = () if shared is None else _leaves(shared.policy_net)
+        _add_modules(found, [*hidden, *_leaves(net.action_net)])
     elif hasattr(actor, "latent_pi"):  # SAC: the mean, squashed
         _add_modules(found, [*_leaves(actor.latent_pi), *_leaves(actor.mu)])
         if not found.activations[-1]:
@@ -291,7 +291,7 @@ def from_onnx(path: Path, mdp: MDP[Any]) -> Found:
     values = {one.name: onnx.numpy_helper.to_array(one) for one in graph.initializer}
     for node in graph.node:
         if node.op_type == "Constant":
-            values[node.output[0]] = onnx.numpy_helper.to_array(node.attribute[0].t)
+            values[node.output[0]] = _constant(onnx, node, path)
     found = Found(mdp.observation_size, policy)
     (given,) = (one.name for one in graph.input if one.name not in values)
     nodes = [node for node in graph.node if node.op_type != "Constant"]
@@ -316,6 +316,23 @@ def from_onnx(path: Path, mdp: MDP[Any]) -> Found:
     if given != graph.output[0].name:
         raise TsbenchError(f"{path} returns something else than the end of its chain")
     return found
+
+
+def _constant(onnx: Any, node: Any, path: Path) -> np.ndarray:
+    """The value of an ONNX Constant.
+
+    Raises:
+        TsbenchError: it is text or sparse.
+    """
+    (attribute,) = node.attribute
+    value = onnx.helper.get_attribute_value(attribute)
+    if attribute.name == "value":
+        return np.asarray(onnx.numpy_helper.to_array(value))
+    if attribute.name in ("value_float", "value_floats", "value_int", "value_ints"):
+        return np.asarray(value)
+    raise TsbenchError(
+        f"{path} holds a Constant by {attribute.name}; allowed: value, value_float(s), value_int(s)"
+    )
 
 
 def _add_node(
