@@ -178,6 +178,23 @@ def test_words_of_other_commands(
     assert hint in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["evaluate", "one", "--protocol", "smoke", TASK], "no policy one; without a file there"),
+        (["export", "one", TASK, "--method", "x", "out"], "no model one: there is no such file"),
+        (["verify", "one", "--threads", "1", "two"], "no entry one"),
+        (["compare", "--json", "x", "one", "--png", "y", "two"], "there is no directory one"),
+        (["evaluate", "--threads", "1", "--", "one", TASK], "no policy one; without a file there"),
+    ],
+)
+def test_options_stand_between_positional_words(
+    words: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(words) == 2
+    assert line in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["plain", "my run", "it's $HOME; *"])
 def test_commands_in_messages_can_be_pasted(name: str, tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / name)
@@ -285,6 +302,18 @@ def test_kept_entries_have_short_names() -> None:
         for word in (name, f"v1/{name}", f"{name}/{first.name}", str(entry), str(first)):
             assert places.run(word) == first, word
             assert RunDirectory(first).policy().info.task == entry.parent.name
+
+
+@pytest.mark.parametrize("name", ["seeded_prm", "seed7", "prm"])
+def test_the_name_of_a_kept_entry_may_begin_with_seed(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kept, "FOLDERS", (tmp_path,))
+    entry = tmp_path / "v1" / "laikago_trot" / name
+    (entry / "seed3").mkdir(parents=True)
+    assert kept.find(f"laikago_trot/{name}") == entry
+    assert kept.find(f"laikago_trot/{name}/seed3") == entry / "seed3"
+    assert kept.find(f"laikago_trot/{name}/seed4") is None
 
 
 def test_a_score_is_compared_with_the_figures_of_the_board() -> None:

@@ -17,8 +17,9 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are TsbenchErrors of one line."""
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """The options. An unknown one is refused with the nearest that there is."""
-        options, others = self.parse_known_args(args, namespace)
+        """The options, which may stand between positional words. An unknown one is refused with the
+        nearest that there is."""
+        options, others = self.parse_known_intermixed_args(args, namespace)
         if not others:
             return options
         flags = [flag for flag in self._option_string_actions if flag.startswith("--")]

@@ -12,7 +12,7 @@ from tsbench.runs.directory import RunDirectory
 from tsbench.runs.schema import RunConfig
 
 KEYS = (*(field.name for field in fields(RunConfig)), "resume")
-PATHS = ("directory=", "resume=", "study=")  # words whose value is a path
+PATHS = ("directory=", "resume=")  # words whose value is a path
 
 
 def expanded(words: Sequence[str]) -> list[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 FOLDERS = (Path(__file__).parents[1] / "leaderboards", Path(__file__).parents[2] / "leaderboards")
 BOARD = "v1"  # the protocol of the kept entries
 _SEED = re.compile(r"seed\d{1,10}")
+_TRAINING = re.compile(rf"(.+)/({_SEED.pattern})")
 
 
 def entries() -> dict[str, Path]:
@@ -33,11 +34,13 @@ def trainings(entry: Path) -> list[Path]:
 def find(name: str) -> Path | None:
     """The directory of a kept entry, TASK/ENTRY, or of one of its trainings, TASK/ENTRY/seedN; None
     if there is no such entry."""
-    entry, _, seed = name.removeprefix(f"{BOARD}/").rstrip("/").partition("/seed")
-    place = entries().get(entry)
-    if place is None or not seed:
-        return place
-    return next((one for one in trainings(place) if one.name == f"seed{seed}"), None)
+    found, name = entries(), name.removeprefix(f"{BOARD}/").rstrip("/")
+    if name in found:
+        return found[name]
+    match = _TRAINING.fullmatch(name)
+    if match is None or match[1] not in found:
+        return None
+    return next((one for one in trainings(found[match[1]]) if one.name == match[2]), None)
 
 
 def _folders(path: Path) -> Iterator[Path]:
