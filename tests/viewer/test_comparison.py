@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -115,6 +117,36 @@ def test_the_picture(made: Callable[..., Results]) -> None:
     for words in found.rows:
         found.curves[words] = (Curve("task", steps, steps / 100.0, steps / 200.0),)
     assert comparison.picture(found).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["old", "new"], "prm, in new less prm, in old"),
+        (["old/seed0", "old/seed1", "new/seed0", "new/seed1"], "prm, in new less prm, in old"),
+        (["old/seed0", "old/copy"], "prm, in old/copy less prm, in old/seed0"),
+        (["old", "new", "new"], "prm, in new less prm, in old"),
+    ],
+)
+def test_runs_by_one_command_are_told_apart_by_their_places(
+    words: list[str],
+    names: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Those before a change of the code and those after it. One folder has a seed more."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    kept = sorted((ROOT / "leaderboards/v1/rocket_navigation/prm").glob("seed*"))
+    for place, one in {"old/seed0": 0, "old/seed1": 1, "new/seed0": 0, "new/seed1": 1}.items():
+        shutil.copytree(kept[one], place)
+    shutil.copytree(kept[0] if "old/copy" in words else kept[2], "old/copy")
+    assert cli.main(["compare", *words, "--json", "found.json"]) == 0
+    text = capsys.readouterr().out
+    assert names.replace("prm,", "prm, shortcut=false,") in re.sub(r"\s+", " ", text)
+    runs = json.loads(Path("found.json").read_text())["runs"]
+    assert not any(word.startswith("in ") for run in runs for word in run["words"])
 
 
 def test_compare_kept_entries(
