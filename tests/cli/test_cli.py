@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pkgutil
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,9 @@ import pytest
 
 from tsbench import cli, methods, tasks
 from tsbench.cli import verbs
+from tsbench.core.errors import TsbenchError
+from tsbench.leaderboard import kept
+from tsbench.runs.directory import RunDirectory
 
 TASK = "task=rocket_navigation"
 
@@ -110,7 +114,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["list", "more"], "unknown task 'more'"),
+        (["list", "more"], "unknown task or method 'more'"),
         (["list", "one", "two"], "unrecognized arguments: two (see tsbench list --help)"),
         (["list", "--jsn", "x"], "unrecognized arguments: --jsn (did you mean --json?)"),
         (["list", "--json", "/proc/none/x"], "/proc/none/x: No such file or directory"),
@@ -227,6 +231,21 @@ def test_output_to_a_full_disk() -> None:
             [sys.executable, "-m", "tsbench"], stdout=full, stderr=subprocess.PIPE, text=True
         )
     assert (done.returncode, done.stderr) == (2, "tsbench: output: No space left on device\n")
+
+
+def test_a_run_whose_pages_fail_still_writes_its_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(run: RunDirectory) -> None:
+        raise TsbenchError("no room")
+
+    monkeypatch.setattr("tsbench.viewer.report.write_pages", fail)
+    entry = next(iter(kept.entries().values()))
+    shutil.copytree(kept.trainings(entry)[0], tmp_path / "mine")
+    assert cli.main(["run", "resume=mine", "--json", "score.json"]) == 2
+    assert "no room; the run is finished, its pages are not" in capsys.readouterr().err
+    score = RunDirectory(tmp_path / "mine").record().score
+    assert json.loads((tmp_path / "score.json").read_text())["success"] == score.success
 
 
 def test_interrupted(tmp_path: Path) -> None:

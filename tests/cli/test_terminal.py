@@ -22,8 +22,9 @@ from tsbench.cli import command, describe, doctor, hints, places, streams, table
 from tsbench.cli.launch import directory
 from tsbench.cli.verbs import run, tune
 from tsbench.core.errors import TsbenchError
-from tsbench.core.words import number
+from tsbench.core.words import number, short
 from tsbench.leaderboard import kept, page
+from tsbench.leaderboard.submission import read_manifest
 from tsbench.runs import config
 from tsbench.runs.directory import Record, RunDirectory
 from tsbench.runs.execute import _way_on
@@ -168,6 +169,7 @@ def test_words_of_run(
         (["evaluate", "one", TASK], "no policy one; without a file there are random and zero"),
         (["evaluate", "x.zip", TASK, "--trust-sb3", "ppo"], "(did you mean 'PPO'?)"),
         (["describe", "Rocket_Navigation"], "(did you mean 'rocket_navigation'?)"),
+        (["describe", "twostgae"], "(did you mean 'twostage'?)"),
     ],
 )  # fmt: skip
 def test_words_of_other_commands(
@@ -265,6 +267,19 @@ def test_a_card_has_two_names(capsys: pytest.CaptureFixture[str]) -> None:
     assert cards[0] == cards[1] != ""
 
 
+@pytest.mark.parametrize("name", methods.names())
+def test_a_method_has_a_card(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["describe", f"method={name}", "--json", "card.json"]) == 0
+    text = capsys.readouterr().out
+    card = json.loads(Path("card.json").read_text())
+    options = dict(config.compose([TASK, f"method={name}"]).method)
+    assert options.pop("name") == card["method"] == name
+    assert [one["name"] for one in card["options"]] == [f"method.{key}" for key in options]
+    assert all(one["name"] in text and one["meaning"] for one in card["options"])
+    for entry in card["kept"]:
+        assert read_manifest(kept.entries()[entry]).method == name
+
+
 @pytest.mark.parametrize("width", [40, 80])
 def test_scores_cut_no_name(width: int, invented_record: Callable[[str], Record]) -> None:
     record = invented_record("laikago_trot")
@@ -272,7 +287,7 @@ def test_scores_cut_no_name(width: int, invented_record: Callable[[str], Record]
     text = shown(lambda console: tables.show_run(console, record, task), width)
     check_width(text, width)
     assert "SOLVED 40 of 100" in text
-    for words in ("solved_reward", "normalized_reward", "best motion known", "policy zero"):
+    for words in ("solved_reward", "normalized_reward", "oracle, the best plan", "policy zero"):
         assert words in text
 
 
@@ -284,6 +299,15 @@ def test_help_follows_the_width(text: str, width: int) -> None:
     lines = [line for line in fitted.splitlines() if line not in examples]
     assert max(map(len, lines)) <= width
     assert fitted.split() == text.split()  # no word is lost
+
+
+@pytest.mark.parametrize(
+    ("steps", "text"),
+    [(0, "0"), (999, "999"), (999.7, "1k"), (5_016, "5.02k"), (999_936, "1M"), (9.27e6, "9.27M"),
+     (2e9, "2G")],
+)  # fmt: skip
+def test_counts_of_steps_in_three_digits(steps: float, text: str) -> None:
+    assert short(steps) == text
 
 
 def test_wide_help_is_the_text_itself() -> None:
@@ -412,10 +436,24 @@ def test_the_doctor_says_what_works(
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 12
     found = json.loads(Path("found.json").read_text())
+    assert found.pop("refused") == []
     assert len(found) == len(lines)
     assert {"tsbench", "packages", "threads", "OpenGL", "GPU", "tasks"} <= found.keys()
     extras = " ".join(text for subject, text in found.items() if subject.startswith("extras"))
     assert all(name in extras for name in ("gpu", "onnx", "sb3", "tune", "video"))
+
+
+def test_the_doctor_names_every_plug_in_that_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "_gpu", lambda: "none")
+    monkeypatch.setattr("tsbench.gl.find_working_backend", lambda: None)
+    monkeypatch.setattr(tasks, "refused", lambda: ("both broken", "no task"))
+    monkeypatch.setattr(methods, "refused", lambda: ("both broken", "no method"))
+    assert cli.main(["doctor", "--json", "found.json"]) == 0
+    assert capsys.readouterr().out.count("both broken") == 1
+    found = json.loads(Path("found.json").read_text())
+    assert found["refused"] == ["both broken", "no task", "no method"]
 
 
 def test_the_doctor_finds_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

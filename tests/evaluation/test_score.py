@@ -51,9 +51,9 @@ def test_references_stand_beside_a_score_of_the_same_constants(
 ) -> None:
     rows = {name: (reward, success) for name, reward, success in
             reference_rows(invented_record(TASK).score)}  # fmt: skip
-    assert rows.keys() == {"best motion known", "policy random", "policy zero"}
+    assert rows.keys() == {"oracle, the best plan", "policy random", "policy zero"}
     assert rows["policy zero"][1] == "0"
-    assert float(rows["best motion known"][0]) > 0.1
+    assert float(rows["oracle, the best plan"][0]) > 0.1
 
 
 @pytest.mark.parametrize("shown", [True, False])

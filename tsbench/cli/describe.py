@@ -1,4 +1,5 @@
-"""A task's card: what a policy sees and does, what it is rewarded for, and what was reached."""
+"""Cards. A task's: what a policy sees and does, what it is rewarded for, and what was reached. A
+method's: what it does, its options, and what was kept of it."""
 
 from __future__ import annotations
 
@@ -13,23 +14,77 @@ from rich.console import Console
 from tsbench import methods, tasks
 from tsbench.cli.rows import show_rows
 from tsbench.cli.tables import kept_rows
+from tsbench.core import plugins
 from tsbench.core.constants import SOURCES, described
+from tsbench.core.errors import unknown
 from tsbench.core.task import Plannable, Task
 from tsbench.core.words import number, several
 from tsbench.evaluation import references
 from tsbench.evaluation.words import REFERENCES
+from tsbench.leaderboard import kept
+from tsbench.leaderboard.submission import read_manifest
 from tsbench.runs import schema
 
 
 def show(console: Console, name: str) -> dict[str, Any]:
-    """Prints a task's card.
+    """Prints the card of a task or of a method.
 
     Returns:
         Its content as plain values.
 
     Raises:
-        TsbenchError: there is no such task.
+        TsbenchError: there is no such task or method, or the method cannot be imported.
     """
+    if name in tasks.names():
+        return _show_task(console, name)
+    if name in methods.names():
+        return _show_method(console, name)
+    raise unknown("task or method", name, (*tasks.names(), *methods.names()), plugins.broken())
+
+
+def _show_method(console: Console, name: str) -> dict[str, Any]:
+    about, options = inspect.getdoc(methods.find(name)) or "", list(_options(name))
+    stages = methods.stages(name)
+    made = [entry for entry, path in kept.entries().items() if read_manifest(path).method == name]
+    facts = {
+        "training stages": f"{', '.join(stages)}: task.training.STAGE.KEY=..."
+        if stages
+        else "none",
+        "tasks": "all" if name == methods.PLANLESS else "tsbench run refuses what it cannot do",
+        "kept entries": ", ".join(made) or "none",
+    }
+    console.print(f"{name}, a method", style="bold", highlight=False)
+    console.print(_prose(about), markup=False, highlight=False)
+    show_rows(console, ("", ""), list(facts.items()), folded=1)
+    if options:
+        show_rows(console, ("option", "default", "meaning"), options, folded=2)
+    line = f"tsbench run task=NAME method={name}{' method.KEY=...' if options else ''}"
+    console.print(f"Try it: {line}", markup=False, highlight=False, soft_wrap=True)
+    keys = ("name", "default", "meaning")
+    return {
+        "method": name,
+        "about": about,
+        "stages": stages,
+        "kept": made,
+        "options": [dict(zip(keys, row, strict=True)) for row in options],
+    }
+
+
+def _options(name: str) -> Iterator[tuple[str, str, str]]:
+    """Word, default and meaning of each option, as its line in the method's configuration says."""
+    for folder in plugins.configurations("method"):
+        if (file := folder / f"{name}.yaml").is_file():
+            for line in file.read_text("utf-8").splitlines():
+                match = _OPTION.fullmatch(line)
+                if match and match[1] != "name":
+                    yield f"method.{match[1]}", match[2], match[3] or ""
+            return
+
+
+_OPTION = re.compile(r"(\w+): *(.*?) *(?:# *(.*))?")
+
+
+def _show_task(console: Console, name: str) -> dict[str, Any]:
     task = tasks.make(name)
     facts, reached = dict(_facts(task)), list(_reached(task))
     constants = list(_constants(task))

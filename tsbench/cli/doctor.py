@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 
-from tsbench import gl, tasks
+from tsbench import gl, methods, tasks
 from tsbench.core import plugins
 from tsbench.core.errors import TsbenchError
 from tsbench.leaderboard import kept
@@ -37,7 +37,7 @@ def findings() -> Iterator[tuple[str, str]]:
     yield "tasks", f"{len(tasks.names())}, and {len(kept.entries())} kept entries"
     others = sorted(str(one) for one in plugins.providers() if one != plugins.own())
     yield "plug-ins", ", ".join(others) or "none"
-    for line in tasks.refused():
+    for line in dict.fromkeys((*tasks.refused(), *methods.refused())):
         yield "refused", line
     yield "directory", _directory()
 

@@ -87,8 +87,8 @@ def launch(words: Sequence[str], json: Path | None = None) -> None:
             return
         train(chosen, _own(flags.overrides))
         place = Path(chosen.directory or "")
-        finish(place)
-    write_json(json, shown(RunDirectory(place).record()))
+    write_json(json, shown(RunDirectory(place).record()))  # whether or not the pages can be made
+    finish(place)
 
 
 def finish(directory: Path, console: Console | None = None) -> None:
@@ -137,7 +137,7 @@ def _own(words: Sequence[str]) -> list[str]:
 
 
 def _resume(place: Path) -> Path:
-    """Continues the training of an unfinished run, or makes the missing pages of a finished run.
+    """Continues the training of an unfinished run. Of a finished one only pages may be missing.
 
     Returns:
         The run directory.
@@ -145,7 +145,6 @@ def _resume(place: Path) -> Path:
     found = RunDirectory(place)
     if not found.finished or found.report_file.exists():
         execute.resume(place)
-    finish(place)
     return place
 
 

@@ -24,12 +24,13 @@ def several(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def short(steps: int) -> str:
-    """A number of steps to three digits, with k for thousands and M for millions."""
-    for size, letter in ((1_000_000, "M"), (1_000, "k")):
-        if steps >= size:
-            return f"{steps / size:.3g}{letter}"
-    return str(steps)
+def short(steps: float) -> str:
+    """A number of steps to three digits: k for thousands, M for millions, G for billions."""
+    rounded = float(f"{steps:.3g}")
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if rounded >= size:
+            return f"{rounded / size:.3g}{letter}"
+    return f"{rounded:.0f}"
 
 
 def number(value: Any) -> str:

@@ -51,7 +51,7 @@ def episode_rows(score: Score, task: Task[Any]) -> Iterator[tuple[str, str, str]
 
 
 REFERENCES = {  # rows of `evaluation.references` in words
-    "oracle": "best motion known",
+    "oracle": "oracle, the best plan",
     "random": "policy random",
     "zero": "policy zero",
 }

@@ -24,7 +24,7 @@ VERBS = {
     "leaderboard": "show the leaderboard: as tables, or as a site",
     "bench": "measure speed, beside alternatives",
     "list": "name the tasks, methods and budgets",
-    "describe": "show a task's card: spaces, reward, constants, what was reached",
+    "describe": "show the card of a task (spaces, reward, constants) or of a method (options)",
     "doctor": "say what works on this machine",
 }
 

@@ -1,4 +1,4 @@
-"""`tsbench describe`: show a task's card: spaces, reward, constants, what was reached."""
+"""`tsbench describe`: show the card of a task or of a method."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tsbench.cli.arguments import verb_parser
 
 def call(words: Sequence[str]) -> None:
     parser = verb_parser("describe")
-    parser.add_argument("task", metavar="TASK", help="its name, which `tsbench list` gives")
+    parser.add_argument("name", metavar="NAME", help="of either, which `tsbench list` gives")
     show_card(parser.parse_args(words))
 
 
@@ -20,4 +20,5 @@ def show_card(options: Any) -> None:
     from tsbench.cli import describe
     from tsbench.core.files import write_json
 
-    write_json(options.json, describe.show(Console(), options.task.removeprefix("task=")))
+    name = options.name.removeprefix("task=").removeprefix("method=")
+    write_json(options.json, describe.show(Console(), name))

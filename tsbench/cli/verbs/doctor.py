@@ -20,4 +20,5 @@ def call(words: Sequence[str]) -> None:
         found.append((subject, state))
         line = f"{subject:<18} {state}"
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    write_json(options.json, dict(found))
+    refused = [state for subject, state in found if subject == "refused"]
+    write_json(options.json, {**dict(found), "refused": refused})

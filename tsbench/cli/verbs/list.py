@@ -11,10 +11,10 @@ from tsbench.core.errors import TsbenchError
 
 def call(words: Sequence[str]) -> None:
     parser = verb_parser("list")
-    what = "show this task's card, as `tsbench describe` does"
-    parser.add_argument("task", nargs="?", metavar="TASK", help=what)
+    what = "show the card of this task or method, as `tsbench describe` does"
+    parser.add_argument("name", nargs="?", metavar="NAME", help=what)
     options = parser.parse_args(words)
-    if options.task is not None:
+    if options.name is not None:
         show_card(options)
         return
     from tsbench import methods, tasks

@@ -32,6 +32,8 @@ words, in Hydra's grammar:
   method.KEY=...   an option of the method
   task.training.STAGE.KEY=...
                    a PPO setting of the plan, imitate, settle, finetune or task stages
+  task.budgets.B.act=N
+                   the steps of budget B in physics; task.budgets.B.plan=N those of planning
   task.constants.KEY=...
                    a constant of the task, for studies: such a score is not ranked
 
