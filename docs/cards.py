@@ -29,9 +29,9 @@ from tsbench.core import plugins
 from tsbench.core.constants import SOURCES, described
 from tsbench.core.files import write_whole
 from tsbench.core.task import MDP, Plannable, Task
-from tsbench.core.words import duration, number, several
+from tsbench.core.words import duration, number, several, short
 from tsbench.leaderboard import page
-from tsbench.leaderboard.page import Row, Table, short
+from tsbench.leaderboard.page import Row, Table
 from tsbench.runs import schema
 
 if TYPE_CHECKING:

@@ -93,6 +93,15 @@ def test_tables_in_markdown(board: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert re.search(r"\| oracle \| 0\.\d+ \|  \| 1 \|  \| - \|  \|  \| reference \|", text)
     assert "retracted: a bug" in text
     assert page.COLUMNS in text
+    assert cli.main(["leaderboard", "--board", str(board), "--json", str(board / "out.json")]) == 0
+    shown = json.loads((board / "out.json").read_text())
+    (board / "out.json").unlink()
+    assert shown["left_out"] == [f"v1/{TASK}/gone: retracted: a bug"]
+    (rows,) = (table["rows"] for table in shown["tables"] if table["rows"])
+    assert {row["entry"]: (row["state"], len(row["seeds"])) for row in rows} == {
+        "one": ("re-scored", 1), "ten": ("submitted", 10)
+    }  # fmt: skip
+    capsys.readouterr()
     assert re.search(
         r"\| steps \| time \| state \|.*\n\|[-|]+\|\n\| one \|.*\| \d+:\d\d \| re-", text
     )
@@ -108,14 +117,35 @@ def site(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_site_replaces_an_earlier_one_and_no_other_files(board: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
     for _ in range(2):
-        page.write_site(board, tmp_path / "site", None, lambda line: None)
+        written = page.write_site(board, site, None, lambda line: None)
+    assert written[-1] == site / "index.html"
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "index.html").write_text("mine")
     for place in (tmp_path / "mine", tmp_path / "mine" / "index.html"):
         with pytest.raises(TsbenchError, match="nothing is overwritten: give another folder"):
             page.write_site(board, place, None, lambda line: None)
     assert (tmp_path / "mine" / "index.html").read_text() == "mine"
+
+
+def test_a_site_loses_the_pages_of_entries_that_are_gone(board: Path, tmp_path: Path) -> None:
+    """And nothing else that lies in it."""
+    site, other = tmp_path / "site", tmp_path / "board"
+    page.write_site(board, site, lambda run: "<p></p>", lambda line: None)
+    (site / TASK / "ten" / "notes.txt").write_text("mine")
+    (site / TASK / "mine").mkdir()
+    (site / TASK / "mine" / "index.html").write_text("mine")
+    shutil.copytree(board, other)
+    for name in ("one", "ten"):
+        entry = other / "v1" / TASK / name
+        verify.record(other, entry, verify.retracted(entry, "a bug"))
+    add(other, "two", [RUN])
+    (site / "index.html").unlink()  # as of a command that broke off before its end
+    written = page.write_site(other, site, None, lambda line: None)
+    left = {site / TASK / "ten" / "notes.txt", site / TASK / "mine" / "index.html"}
+    assert {path for path in site.rglob("*") if path.is_file()} == {*written, *left}
+    assert not (site / TASK / "one").exists()
 
 
 def test_texts_of_an_entry_are_nothing_but_text(site: Path) -> None:

@@ -27,7 +27,7 @@ from tsbench.evaluation import protocol as protocols
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import PROTOCOLS, SMOKE, V1
 from tsbench.evaluation.replay import contradictions, differences
-from tsbench.leaderboard import submission, verify
+from tsbench.leaderboard import page, recipe, submission, verify
 from tsbench.leaderboard.submission import Described, Manifest
 from tsbench.runs import config, execute
 from tsbench.runs.directory import RunDirectory
@@ -721,6 +721,30 @@ def test_training_again_uses_nothing_of_its_author_s_machine(finished: Path) -> 
 
     verify.verify(ENTRY, verify.Asked(rescore=False, train=train))
     assert [(one.loggers, one.checkpoint) for one in asked] == [((), 30.0)]
+
+
+def test_a_command_that_makes_other_settings_today_is_told(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As after a change of a default, or when an option is gone."""
+    assert recipe.remark(RunDirectory(finished)) == ""
+    for before, after, said in (
+        ("  explore: 0.75", "  explore: 0.5", "makes its settings with method.explore=0.5 added"),
+        ("\n", " method.old=1\n", "this version of tsbench refuses its command: "),
+    ):
+        text = (finished / "config.yaml").read_text()
+        (finished / "config.yaml").write_text(text.replace(before, after, 1))
+        if "old" in after:
+            other_config(finished, "  explore:", "  old: 1\n  explore:")
+        run = RunDirectory(finished)
+        run.versions_file.write_bytes(
+            encode_json(run.versions() | {"configuration": identity_hash(run.settings())})
+        )
+        assert submit("one", "--hardware", "mine") == 0
+        assert said in capsys.readouterr().out
+        page.write_site(Path("board"), Path("site"), None, lambda line: None)
+        assert said in Path("site/rocket_navigation/mine/index.html").read_text()
+        shutil.rmtree("board")
 
 
 def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,7 +56,7 @@ def board(given: Path | None, here: Path, *, written: bool) -> Path:
         TsbenchError: there is none, or none here to write to.
     """
     kept_board = next((folder for folder in kept.FOLDERS if folder.is_dir()), here)
-    chosen = given or (here if written or (here / kept.BOARD).is_dir() else kept_board)
+    chosen = given or (here if written or (here / kept.PROTOCOL).is_dir() else kept_board)
     if not chosen.is_dir():
         raise TsbenchError(f"no board {chosen}: --board names its directory")
     return chosen

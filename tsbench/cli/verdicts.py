@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-BOARD = Path("leaderboards")
 BOARD_HELP = "(leaderboards here, else the kept entries)"
 
 

@@ -35,8 +35,8 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 _COMMIT = re.compile(r"[0-9a-f]{40}([0-9a-f]{24})?\+?")
 _VERSION = re.compile(r"[0-9][0-9A-Za-z.+!_-]{0,63}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_KEY = re.compile(r"[a-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
-_WORD = re.compile(r"[A-Za-z0-9_.+-]+")  # a value that stands for itself in Hydra's grammar
+KEY = re.compile(r"[a-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*")
+WORD = re.compile(r"[A-Za-z0-9_.+-]+")  # a value that stands for itself in Hydra's grammar
 _PLAIN = {"true": True, "false": False, "null": None}
 
 
@@ -127,7 +127,7 @@ def _of_command(command: str, settings: Any) -> Iterator[str]:
         key = key.lstrip("+")
         if key in ("task", "method"):
             key += ".name"
-        if not (equals and _KEY.fullmatch(key) and _WORD.fullmatch(value)):
+        if not (equals and KEY.fullmatch(key) and WORD.fullmatch(value)):
             continue
         if key in ELSEWHERE or key.startswith("hydra.") or (key, value) == ("device", "auto"):
             continue

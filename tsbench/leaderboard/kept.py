@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-# A wheel ships leaderboards/ inside the package; a checkout has it beside the package.
-FOLDERS = (Path(__file__).parents[1] / "leaderboards", Path(__file__).parents[2] / "leaderboards")
-BOARD = "v1"  # the protocol of the kept entries
+BOARD = Path("leaderboards")  # in a checkout
+# A wheel ships it inside the package; a checkout has it beside the package.
+FOLDERS = (Path(__file__).parents[1] / BOARD, Path(__file__).parents[2] / BOARD)
+PROTOCOL = "v1"  # of the kept entries
 _SEED = re.compile(r"seed\d{1,10}")
 _TRAINING = re.compile(rf"(.+)/({_SEED.pattern})")
 
@@ -16,7 +17,7 @@ _TRAINING = re.compile(rf"(.+)/({_SEED.pattern})")
 def entries() -> dict[str, Path]:
     """The directories of the kept entries, by TASK/ENTRY, sorted."""
     for folder in FOLDERS:
-        if (board := folder / BOARD).is_dir():
+        if (board := folder / PROTOCOL).is_dir():
             return {
                 f"{task.name}/{entry.name}": entry
                 for task in _folders(board)
@@ -34,7 +35,7 @@ def trainings(entry: Path) -> list[Path]:
 def find(name: str) -> Path | None:
     """The directory of a kept entry, TASK/ENTRY, or of one of its trainings, TASK/ENTRY/seedN; None
     if there is no such entry."""
-    found, name = entries(), name.removeprefix(f"{BOARD}/").rstrip("/")
+    found, name = entries(), name.removeprefix(f"{PROTOCOL}/").rstrip("/")
     if name in found:
         return found[name]
     match = _TRAINING.fullmatch(name)

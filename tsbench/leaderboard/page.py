@@ -7,6 +7,7 @@ load anything from elsewhere.
 from __future__ import annotations
 
 import importlib.resources
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +19,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import taken, write_whole
-from tsbench.core.words import duration, number
+from tsbench.core.words import duration, number, short
 from tsbench.evaluation.protocol import V1
 from tsbench.evaluation.references import stored
 from tsbench.evaluation.statistics import RANKED_SEEDS, Aggregate, aggregate
 from tsbench.evaluation.words import FIGURES
+from tsbench.leaderboard import recipe
 from tsbench.leaderboard.submission import MANIFEST, Entry, read_entry
 from tsbench.leaderboard.verify import (
     CLAIMS,
@@ -93,16 +95,18 @@ class Row:
 
 
 ORACLE = (
-    "oracle: the best plan, as if physics followed it exactly. The planner's speed limits bind it "
-    "and do not bind physics, so an entry may earn more."
+    "oracle: the best plan known, as if physics followed it exactly. The planner's speed limits "
+    "bind it and do not bind physics, so an entry may earn more."
 )
 
 
 COLUMNS = (
     "solved_reward: the interquartile mean over an entry's trainings, from "
-    f"{RANKED_SEEDS} on with a 95 % interval; the other figures are means over them. steps, "
-    "time: of one training. tuning trials: choices of settings that were tried before. seeds: "
-    "trainings that are kept."
+    f"{RANKED_SEEDS} on with a 95 % interval; the other figures are means over them. of the best "
+    "known: solved_reward over the largest one of the task, be it an entry's or the oracle's. "
+    "steps, time: of one training. state: the last step of tsbench verify that the entry has "
+    f"passed, of {', '.join(STATES)}. tuning trials: choices of settings that were tried before. "
+    "seeds: trainings that are kept."
 )
 
 
@@ -206,14 +210,6 @@ def _row(
     )
 
 
-def short(steps: float) -> str:
-    """A number of steps to three digits, with k for thousands and M for millions."""
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if steps >= size:
-            return f"{steps / size:.3g} {letter}"
-    return f"{steps:.0f}"
-
-
 def markdown(found: Sequence[Table], left_out: Sequence[str], before: str) -> str:
     """The tables in Markdown, after the text `before`."""
     lines = [before.rstrip()]
@@ -248,12 +244,44 @@ def markdown(found: Sequence[Table], left_out: Sequence[str], before: str) -> st
     return "\n".join(lines) + "\n"
 
 
+def plain(found: Sequence[Table], left_out: Sequence[str]) -> dict[str, Any]:
+    """The tables as JSON holds them."""
+    shown = [
+        {
+            "task": table.task,
+            "best": table.best,
+            "measure": table.measure[0],
+            "rows": [_plain_row(row) for row in table.rows],
+            "references": table.references,
+        }
+        for table in found
+    ]
+    return {"tables": shown, "left_out": list(left_out)}
+
+
+def _plain_row(row: Row) -> dict[str, Any]:
+    steps, substeps, seconds = row.cost
+    return {
+        "entry": row.name,
+        "solved_reward": row.reward.iqm,
+        "interval": row.reward.interval,
+        "of_the_best_known": row.share,
+        **row.figures,
+        "steps": steps,
+        "substeps": substeps,
+        "seconds": seconds,
+        "state": row.state,
+        "tuning_trials": row.entry.manifest.described.tuning_trials,
+        "seeds": [kept.training.seed for kept in row.entry.kept],
+    }
+
+
 def write_site(
     board: Path, folder: Path, report: Report | None, tell: Callable[[str], None]
 ) -> list[Path]:
-    """Writes the site: `index.html`, and for each entry a page, its manifest and its reports.
+    """Writes the site: for each entry a page, its manifest and its reports, and `index.html` last.
 
-    Files of an earlier site are replaced, and those of nobody else.
+    Files of an earlier site are replaced or, as those of a retracted entry, removed; no others are.
 
     Args:
         board: with the entries.
@@ -262,41 +290,70 @@ def write_site(
         tell: takes a line before each page that takes long.
 
     Returns:
-        The files.
+        The files, `index.html` last.
 
     Raises:
         TsbenchError: the folder holds other files, one cannot be written, or a verdict is damaged.
     """
+    index = folder / "index.html"
     with os_errors(folder):
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            earlier = folder / "index.html"
-            if not (earlier.is_file() and MARK in earlier.read_bytes()[:2000]):
-                raise taken(folder, "other files", "give another folder by --html DIR")
+        # Without the index it is the site that was being written when a command broke off.
+        own = _marked(index) if index.exists() else bool(_homes(folder))
+        if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not own)):
+            raise taken(folder, "other files", "give another folder by --html DIR")
     found, left_out = tables(board)
     templates = _templates()
     written: dict[Path, bytes] = {}
-    index = templates.get_template("index.html")
-    page = index.render(
-        tables=found, left_out=left_out, figures=FIGURES, oracle=ORACLE, protocol=V1.name
-    )
-    written[folder / "index.html"] = page.encode()
     one = templates.get_template("entry.html")
     for table in found:
         for row in table.rows:
             home = folder / table.task / row.name
             linked = report is not None
-            text = one.render(row=row, table=table, manifest=row.entry.manifest, reports=linked)
+            remarks = {kept.training.folder: recipe.remark(kept.run) for kept in row.entry.kept}
+            text = one.render(
+                row=row, table=table, manifest=row.entry.manifest, reports=linked, remarks=remarks
+            )
             written[home / "index.html"] = text.encode()
             written[home / MANIFEST] = (row.entry.path / MANIFEST).read_bytes()
             for kept in row.entry.kept if report else ():
                 tell(f"{row.entry.name}, seed {kept.training.seed}: 3-D view and figures")
                 assert report is not None
                 written[home / f"{kept.training.folder}.html"] = report(kept.run).encode()
+    page = templates.get_template("index.html").render(
+        tables=found, left_out=left_out, figures=FIGURES, oracle=ORACLE, columns=COLUMNS,
+        protocol=V1.name,
+    )  # fmt: skip
+    written[index] = page.encode()
+    with os_errors(folder):
+        for home in _homes(folder):
+            for path in home.iterdir():
+                if path not in written and _PAGE.fullmatch(path.name):
+                    path.unlink()
+            if not any(home.iterdir()):
+                home.rmdir()
     for path, content in written.items():
         with os_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, content)
     return list(written)
+
+
+_PAGE = re.compile(rf"index\.html|seed\d+\.html|{re.escape(MANIFEST)}")  # files of an entry
+
+
+def _marked(path: Path) -> bool:
+    """Whether a file is a page of a site."""
+    return path.is_file() and MARK in path.read_bytes()[:2000]
+
+
+def _homes(folder: Path) -> list[Path]:
+    """The folders of the entries that an earlier site in that folder has."""
+    return [
+        page.parent
+        for task in tasks.names()
+        for page in (folder / task).glob("*/index.html")
+        if _marked(page)
+    ]
 
 
 def _templates() -> Environment:

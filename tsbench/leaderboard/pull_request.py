@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tsbench.core.errors import TsbenchError, quoted
+from tsbench.leaderboard.kept import BOARD
 from tsbench.leaderboard.submission import FILE, MANIFEST
 
-BOARD = "leaderboards"
 MOST_FILES = 2000
 _PLACE = re.compile(rf"({BOARD}/v[0-9]+/[a-z0-9_]+/[a-z0-9][a-z0-9_.+-]*)/(.+)")
 REGULAR = "100644"  # mode of a file that is no link and cannot be executed

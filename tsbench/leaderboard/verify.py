@@ -36,6 +36,7 @@ from tsbench.evaluation.origin import Origin
 from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.evaluation.replay import compare, incomparable, replay
 from tsbench.evaluation.score import Score
+from tsbench.leaderboard import recipe
 from tsbench.leaderboard.submission import Claim, Entry, Kept, read_entry, read_manifest
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.schema import RunConfig
@@ -195,6 +196,8 @@ def _notes(entry: Entry) -> Iterator[str]:
         yield f"not kept: the trainings with seeds {', '.join(map(str, left))}"
     for one in entry.kept:
         yield from one.remarks
+        if remark := recipe.remark(one.run):
+            yield f"{one.run.path.name}: {remark}"
 
 
 def _verify(entry: Entry, asked: Asked, findings: _Findings, tell: Tell) -> None:

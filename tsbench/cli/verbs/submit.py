@@ -8,8 +8,9 @@ from typing import Any
 
 from tsbench.cli import places
 from tsbench.cli.arguments import count, seeds, threads, verb_parser
-from tsbench.cli.verdicts import BOARD, show_verdict, tell
+from tsbench.cli.verdicts import show_verdict, tell
 from tsbench.core.errors import TsbenchError
+from tsbench.leaderboard.kept import BOARD
 
 
 def call(words: Sequence[str]) -> int:

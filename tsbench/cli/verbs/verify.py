@@ -8,8 +8,9 @@ from pathlib import Path
 
 from tsbench.cli import places
 from tsbench.cli.arguments import new_file, threads, verb_parser
-from tsbench.cli.verdicts import BOARD, BOARD_HELP, show_verdict, tell
+from tsbench.cli.verdicts import BOARD_HELP, show_verdict, tell
 from tsbench.core.errors import TsbenchError
+from tsbench.leaderboard.kept import BOARD
 
 
 def call(words: Sequence[str]) -> int:
