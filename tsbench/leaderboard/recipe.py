@@ -47,7 +47,8 @@ def lacking(run: RunDirectory) -> tuple[str, ...]:
         return ()
     kept = run.config()
     # A seed is no default, and without it the trainings of an entry have one command.
-    given = tuple(word for word in words if not word.startswith(("seed=", "device=")))
+    left_out = ("seed=", "device=", "hydra.")
+    given = tuple(word for word in words if not word.lstrip("+").startswith(left_out))
     made = _settings((*given, f"device={kept.device}"))
     wanted = {
         key: value
