@@ -6,6 +6,7 @@ import itertools
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -81,8 +82,9 @@ BALL = """<mujoco><worldbody><geom type="plane" size="9 9 1" rgba="1 1 1 1"/>
 </mujoco>"""
 
 
-def pictures_of(more: str = "") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A black ball behind a ghost of itself, and the same without the ghost."""
+def pictures_of(more: str = "") -> list[NDArray[np.float64]]:
+    """A black ball behind a ghost of itself, the same without the ghost, and the ghost alone, which
+    hides what is behind it."""
     model = mujoco.MjModel.from_xml_string(BALL.format(more=more))
     executed, ghost = np.zeros((2, 7)), np.zeros((2, 7))
     executed[:, 2:4], ghost[:, 2:4] = (0.4, 1.0), (0.4, 1.0)
@@ -94,31 +96,28 @@ def pictures_of(more: str = "") -> tuple[NDArray[np.float64], NDArray[np.float64
     ]
     found = []
     with film.Camera(Show(model, actors, ""), (200, 200)) as camera:
-        for cast in (actors, actors[:1]):
+        for cast in (actors, actors[:1], actors[1:]):
             shot = film.Shot(cast, np.array([0.0, 0.0, 0.4]), 6.0, mujoco.MjrRect(0, 0, 200, 200))
             found.append(camera._take([shot], 0.0).astype(float))
-    return found[0], found[1]
+    return found
 
 
 def test_a_ghost_can_be_seen_through() -> None:
     """The contrast between the ball and the ground behind a ghost is 1 - GHOST_OPACITY of what it
-    is without the ghost, at every point."""
-    seen, alone = pictures_of()
+    is without the ghost, at every point but the ghost's smoothed edge."""
+    seen, alone, opaque = pictures_of()
     ghost = np.abs(seen - alone).max(axis=-1) > 8
     ball = alone.max(axis=-1) < 30
     assert (ghost & ball).sum() > 50
     assert (ghost & ~ball).sum() > 50
-    tint = (seen - (1.0 - GHOST_OPACITY) * alone)[ghost] / GHOST_OPACITY
-    assert tint.min() > -3.0
-    assert tint.max() < 258.0  # a colour: the ghost's own
-    through = seen[ghost & ~ball].mean(axis=0) - seen[ghost & ball].mean(axis=0)
-    plain = alone[ghost & ~ball].mean(axis=0) - alone[ghost & ball].mean(axis=0)
-    assert through.mean() > 0.4 * plain.mean()
+    through = seen - GHOST_OPACITY * opaque
+    error = np.abs(through - (1.0 - GHOST_OPACITY) * alone).max(axis=-1)
+    assert np.quantile(error[ghost], 0.95) < 2.0  # of 255
 
 
 def test_the_parts_of_a_ghost_do_not_add_up() -> None:
-    one, _ = pictures_of()
-    many, _ = pictures_of('<geom size=".39" rgba="1 0 0 1"/><geom size=".38"/><geom size=".1"/>')
+    one, *_ = pictures_of()
+    many, *_ = pictures_of('<geom size=".39" rgba="1 0 0 1"/><geom size=".38"/><geom size=".1"/>')
     assert np.abs(one - many).mean() < 1.0
 
 
@@ -254,3 +253,30 @@ def test_what_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(TsbenchError, match=r"pip install 'tsbench\[video\]'"):
         film.write_video(shown, tmp_path / "x.mp4")
     assert there.read_text() == "mine"
+
+
+def test_no_other_file_is_touched(tmp_path: Path) -> None:
+    """Not those that lie where earlier versions wrote, and no file that appears meanwhile."""
+    shown, mine = Show(*ball_at_rest(2, 0.1)), tmp_path / "mine.txt"
+    mine.write_text("mine")
+    for name in ("x.mp4.part.mp4", "x.png.part"):
+        (tmp_path / name).symlink_to(mine)
+    before = set(tmp_path.iterdir())
+    film.write_video(shown, tmp_path / "x.mp4")
+    film.write_strip(shown, tmp_path / "x.png", 1)
+    assert set(tmp_path.iterdir()) - before == {tmp_path / "x.mp4", tmp_path / "x.png"}
+    late = tmp_path / "late.mp4"
+    with pytest.raises(TsbenchError, match=r"late\.mp4 exists and nothing is overwritten"):
+        film.write_video(shown, late, lambda _: late.write_text("mine") and None)
+    assert mine.read_text() == late.read_text() == "mine"
+
+
+def test_a_strip_has_room_for_long_names(tmp_path: Path) -> None:
+    model, (actor,), title = ball_at_rest(2)
+    long = replace(actor, name="A: prm, shortcut=true, seed 3")
+    film.write_strip(Show(model, [long], title), tmp_path / "strip.png", 1)
+    strip = np.asarray(Image.open(tmp_path / "strip.png").convert("L"))
+    gutter = strip.shape[1] - film.CELL
+    columns = np.flatnonzero((strip[40:, :gutter] < 255).any(axis=0))
+    assert columns.min() >= film.EDGE - 2
+    assert columns.max() <= gutter - film.EDGE + 2

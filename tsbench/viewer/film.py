@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -17,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from tsbench.core.errors import TsbenchError
-from tsbench.core.files import check_ending, check_new
+from tsbench.core.errors import TsbenchError, os_errors
+from tsbench.core.files import check_ending, check_new, write_new
 from tsbench.viewer import scene
 from tsbench.viewer.framing import Framing, framing
 from tsbench.viewer.scene import Array
@@ -65,10 +67,11 @@ def write_video(show: Show, path: Path, progress: Progress | None = None) -> Non
     check_new(path)
     if imageio_ffmpeg is None:
         raise TsbenchError("videos need an encoder: pip install 'tsbench[video]' (imageio-ffmpeg)")
-    temporary = path.with_name(path.name + ".part.mp4")  # ffmpeg chooses the format by the ending
-    with Camera(show) as camera, _removed(temporary, path):
+    # ffmpeg replaces files and follows links, so it writes into a folder of its own.
+    with Camera(show) as camera, os_errors(path), tempfile.TemporaryDirectory() as folder:
+        drawn = Path(folder) / "film.mp4"
         writer = imageio_ffmpeg.write_frames(
-            str(temporary), camera.size, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=4
+            str(drawn), camera.size, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=4
         )
         with contextlib.closing(writer):
             writer.send(None)
@@ -80,7 +83,7 @@ def write_video(show: Show, path: Path, progress: Progress | None = None) -> Non
             last = camera.frame(camera.duration)
             for _ in range(FRAMES_PER_SECOND):
                 writer.send(last)
-        temporary.replace(path)
+        write_new(path, drawn.read_bytes())
 
 
 def write_strip(show: Show, path: Path, count: int = 6) -> None:
@@ -98,7 +101,8 @@ def write_strip(show: Show, path: Path, count: int = 6) -> None:
     check_ending(path, ".png")
     check_new(path)
     rows = sorted(show.actors, key=lambda actor: not actor.ghost)
-    gutter, header = 110, 34
+    widest = max(_font(18).getlength(actor.name) for actor in rows)
+    gutter, header = max(110, math.ceil(widest) + 2 * EDGE), 34
     strip = Image.new("RGB", (gutter + count * CELL, header + len(rows) * CELL), "white")
     pen = ImageDraw.Draw(strip)
     with Camera(show, (CELL, CELL)) as camera:
@@ -115,10 +119,9 @@ def write_strip(show: Show, path: Path, count: int = 6) -> None:
         for row, actor in enumerate(rows):
             middle = header + (row + 0.5) * CELL
             pen.text((gutter / 2, middle), actor.name, _bytes(actor.colour), _font(18), anchor="mm")
-    temporary = path.with_name(path.name + ".part")
-    with _removed(temporary, path):
-        strip.save(temporary, "PNG", optimize=True)
-        temporary.replace(path)
+    content = io.BytesIO()
+    strip.save(content, "PNG", optimize=True)
+    write_new(path, content.getvalue())
 
 
 class Camera:
@@ -432,19 +435,3 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _bytes(colour: Rgb) -> tuple[int, int, int]:
     red, green, blue = (round(255 * value) for value in colour)
     return red, green, blue
-
-
-@contextlib.contextmanager
-def _removed(temporary: Path, path: Path) -> Iterator[None]:
-    """Removes the temporary file at the end, and names the file in errors.
-
-    Raises:
-        TsbenchError: the file cannot be written.
-    """
-    try:
-        yield
-    except OSError as error:
-        reason = str(error.strerror or error).partition("\n")[0]
-        raise TsbenchError(f"cannot write {path}: {reason}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
