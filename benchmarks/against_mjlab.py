@@ -15,10 +15,7 @@ import argparse
 import sys
 import time
 
-import mjlab.tasks  # noqa: F401  registers its tasks
 import torch
-from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.registry import load_env_cfg
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 CHUNK = 20  # control steps between two looks at the clock
@@ -28,6 +25,11 @@ DRAWN = 16  # different actions, drawn in advance
 
 def rate(worlds: int, device: str, seconds: float) -> tuple[float, int]:
     """The median of control steps per second, and physics steps in a control step."""
+    # Here, since compare.py imports this file too.
+    import mjlab.tasks  # noqa: F401  registers its tasks
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.tasks.registry import load_env_cfg
+
     config = load_env_cfg(TASK)
     config.scene.num_envs = worlds
     environment = ManagerBasedRlEnv(cfg=config, device=device)

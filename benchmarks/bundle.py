@@ -118,6 +118,23 @@ def split(wheels: list[Path], folder: Path) -> int:
     return len(parts)
 
 
+def renew(folder: Path) -> None:
+    """Makes the folder, in place of an earlier bundle. It has the names of one from the beginning,
+    so that one that was interrupted is known too.
+
+    Raises:
+        FileExistsError: the folder holds something else.
+    """
+    known = [folder / name for name in ("install", "SHA256SUMS")]
+    if folder.exists():
+        if not folder.is_dir() or (any(folder.iterdir()) and not all(p.is_file() for p in known)):
+            raise FileExistsError(f"{folder} is no bundle: give a new or an empty folder")
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+    for path in known:
+        path.touch()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "build" / "gpu-bundle")
@@ -125,9 +142,12 @@ def main() -> None:
     parser.add_argument("--not-needed", default=NOT_NEEDED, help="names of packages to leave out")
     options = parser.parse_args()
     have = {canonicalize_name(name) for name in f"{options.have} {options.not_needed}".split()}
-    shutil.rmtree(options.folder, ignore_errors=True)
+    try:
+        renew(options.folder)
+    except FileExistsError as error:
+        parser.error(str(error))
     whole = options.folder / "whole"
-    whole.mkdir(parents=True)
+    whole.mkdir()
     for name, release in needed(have).items():
         sys.stdout.write(f"{name} {release}\n")
         fetch(name, release, whole)

@@ -209,7 +209,7 @@ class Checks:
             f"with control and reading, {whole:,.0f} the environment"
         )
 
-    def flipped(self, path: Path) -> None:
+    def flipped(self, entry: str, path: Path) -> None:
         run = RunDirectory(path)
         record, policy = run.record(), run.policy()
         task = run.task(record.task)
@@ -218,9 +218,9 @@ class Checks:
         )
         certified = replace(record.score, changes={})
         for one in flips(certified, other):
-            say(f"{task.name}: {one.verdict}: {one.flipped} of {one.verdicts} ({one.share:.1%})")
+            say(f"{entry}: {one.verdict}: {one.flipped} of {one.verdicts} ({one.share:.1%})")
         say(
-            f"{task.name}: solved_reward {other.solved_reward:.4f} here, "
+            f"{entry}: solved_reward {other.solved_reward:.4f} here, "
             f"{certified.solved_reward:.4f} certified"
         )
 
@@ -242,6 +242,18 @@ class Checks:
             f"{bare:,.0f} control steps/s physics alone"
         )
         self.failed += not equal
+
+
+def kept(entries: Path) -> dict[str, Path]:
+    """The run with the lowest seed of each kept entry, by TASK/ENTRY."""
+
+    def seed(run: Path) -> int:
+        return int(run.name.removeprefix("seed"))
+
+    return {
+        f"{entry.parent.name}/{entry.name}": min(entry.glob("seed*"), key=seed)
+        for entry in sorted(path.parent for path in entries.glob("*/*/manifest.json"))
+    }
 
 
 def main() -> int:
@@ -269,12 +281,12 @@ def main() -> int:
         for name in MODELS:
             if count in WORLDS[name] and count <= options.most:
                 sections[f"speed, {name}, {count:,}"] = partial(checks.speed, name, count)
-    for path in sorted(ENTRIES.glob("*/*/seed0")):
-        sections[f"flips, {path.parent.parent.name}"] = partial(checks.flipped, path)
     for name in MODELS:
         sections[f"divergence, {name}"] = partial(checks.safe, name)
     sections["room"] = partial(checks.lies_on_the_ground, min(4_096, options.most))
     sections["deterministic"] = partial(checks.repeats, min(8_192, options.most))
+    for entry, path in kept(ENTRIES).items():  # many, so they come last
+        sections[f"flips, {entry}"] = partial(checks.flipped, entry, path)
     for name, run in sections.items():
         if options.only and not name.startswith(tuple(options.only)):
             continue

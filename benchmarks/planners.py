@@ -13,9 +13,10 @@ clearance of the plan from what is to be avoided; whether the plan passes its au
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,12 @@ from rich.console import Console
 from rich.table import Table
 
 from tsbench import tasks
+from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.roadmap import RoadmapSpace
 from tsbench.core.task import Plannable, plannable, roadmap_space
 from tsbench.planning.roadmap import find_route, resampled
 from tsbench.sim.kinematic import plan_along
+from tsbench.tasks.rocket import Rocket
 
 SAMPLES = (250, 1000, 4000, 16_000)
 SEEDS = (0, 1, 2)
@@ -90,7 +93,20 @@ def clearance(task: Any, qpos: np.ndarray) -> float:
     return float(state.clearance.min(initial=np.inf))
 
 
-def main(names: list[str]) -> None:
+def chosen(names: Sequence[str]) -> list[str]:
+    """The tasks of these names; without any all rockets.
+
+    Raises:
+        TsbenchError: there is no such rocket.
+    """
+    known = [name for name in tasks.names() if isinstance(tasks.make(name), Rocket)]
+    for name in names:
+        if name not in known:
+            raise unknown("rocket", name, known)
+    return [*names] or known
+
+
+def show(names: Sequence[str]) -> None:
     console = Console(width=120)
     for name in names:
         task = plannable(tasks.make(name))
@@ -111,5 +127,16 @@ def main(names: list[str]) -> None:
         console.print(table)
 
 
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help="(all rockets)")
+    try:
+        show(chosen(parser.parse_args().tasks))
+    except TsbenchError as error:
+        sys.stderr.write(f"planners: {error}\n")
+        return 2
+    return 0
+
+
 if __name__ == "__main__":
-    main(sys.argv[1:] or ["rocket_navigation", "rocket_obstacles"])
+    sys.exit(main())

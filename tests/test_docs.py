@@ -5,8 +5,8 @@ The second word of a block's info string says what is done with it here:
 - `sh run`: its commands are run, in a directory with the board in it. RUN is a run with
   `budget=smoke`, which the README's first block makes.
 - `sh check`: its commands are checked, but take too long, need a network or wait for someone. A
-  training's configuration is composed; the words of every other verb are parsed; make says what it
-  would do; files, modules and extras have to exist, and scripts have to know the flags.
+  training's configuration is composed; the words of every other verb and of scripts are parsed;
+  make says what it would do; files, modules and extras have to exist.
 - `sh elsewhere`: the same for commands of another machine, such as one with a GPU.
 - `sh example`: test_example.py runs them, with the package of docs/extending.md installed.
 - `python`: run, the blocks of a page one after the other. `yaml` and `toml` are parsed.
@@ -21,8 +21,12 @@ import importlib.util
 import json
 import os
 import re
+import runpy
+import signal
 import subprocess
+import sys
 import tomllib
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -257,10 +261,29 @@ def check_python(words: list[str]) -> None:
     elif words[0] == "-c":
         compile(words[1], "-c", "exec")
     else:
-        script = (ROOT / words[0]).read_text(encoding="utf-8")
-        helpers = "".join(path.read_text() for path in (ROOT / words[0]).parent.glob("*.py"))
-        for word in words[1:]:
-            assert not word.startswith("-") or word in script or word in helpers, word
+        check_script(ROOT / words[0], words[1:])
+
+
+def check_script(script: Path, words: list[str]) -> None:
+    """Runs a script until it has parsed its words. One that needs a package that is not here, such
+    as OMPL, is not checked, nor one that parses none."""
+    if not re.search("argparse|cli import main", script.read_text(encoding="utf-8")):
+        return
+    handler = signal.getsignal(signal.SIGTERM)  # a script may set its own
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ArgumentParser, "parse_args", _stopping(ArgumentParser.parse_args))
+        patch.setattr(sys, "argv", [str(script), *words])
+        patch.syspath_prepend(script.parent)
+        try:
+            with pytest.raises(ParsedError):
+                runpy.run_path(str(script), run_name="__main__")
+        except ModuleNotFoundError as missing:
+            if missing.name not in ("planner_ompl", "mujoco_warp", "warp"):
+                raise
+        except SystemExit as refused:
+            raise AssertionError(f"{script.name} refuses {words}") from refused
+        finally:
+            signal.signal(signal.SIGTERM, handler)
 
 
 def check_pytest(words: list[str]) -> None:
@@ -294,6 +317,27 @@ CHECKS: dict[str, Callable[[list[str]], None]] = {
     "torchrun": check_torchrun,
     ".ci/run": lambda words: None,
 }
+
+
+SCRIPTS = {
+    words
+    for page in PAGES
+    for words in re.findall(
+        r"(?<!`)`python3? (\w+/\w+\.py[^`\n]*)`", page.read_text(encoding="utf-8")
+    )
+}
+
+
+@pytest.mark.parametrize("words", sorted(SCRIPTS))
+@pytest.mark.usefixtures("parsing")
+def test_scripts_that_texts_name_are_right(words: str) -> None:
+    check_python([stood_in(word) for word in words.split()])
+
+
+@pytest.mark.usefixtures("parsing")
+def test_a_wrong_word_of_a_script_would_be_noticed() -> None:
+    with pytest.raises(AssertionError, match=r"gpu_check\.py refuses \['--what'\]"):
+        check_python(["benchmarks/gpu_check.py", "--what"])
 
 
 @pytest.mark.parametrize("words", ["view RUN --films x", "evaluate", "paint RUN"])

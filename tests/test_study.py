@@ -1,4 +1,5 @@
-"""The study of benchmarks/: what it does not run again, what it begins again, and what it keeps."""
+"""Programs of benchmarks/: what a study does not run again, what it begins again, and what it
+keeps; and what a mistake in a call of the others does."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import sys
 from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -131,3 +133,39 @@ def test_a_line_that_cannot_be_read_is_named(study: Study, line: str) -> None:
     status, _, error = study("", line)
     assert status == 2
     assert "study.txt, line 2: " in error
+
+
+def test_a_bundle_replaces_no_other_folder(tmp_path: Path) -> None:
+    bundle, folder = outside("bundle"), tmp_path / "mine"
+    folder.mkdir()
+    bundle.renew(folder)  # an empty one
+    bundle.renew(folder)  # one of a bundle that was interrupted
+    (folder / "SHA256SUMS").unlink()
+    with pytest.raises(FileExistsError, match="mine is no bundle"):
+        bundle.renew(folder)
+    assert (folder / "install").exists()
+
+
+def test_each_kept_entry_is_checked_on_a_gpu() -> None:
+    pytest.importorskip("mujoco_warp")
+    board = Path(__file__).parents[1] / "leaderboards" / "v1"
+    kept = outside("gpu_physics").kept(board)
+    assert {board / entry / run.name for entry, run in kept.items()} == set(kept.values())
+    assert set(kept) == {f"{path.parts[-3]}/{path.parts[-2]}" for path in board.glob("*/*/seed*")}
+
+
+@pytest.mark.parametrize("name", ["footsteps", "planners"])
+def test_a_wrong_task_is_told_in_a_line(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "planners":  # OMPL is not among the packages of the tests
+        ompl = SimpleNamespace(PLANNERS=(), Ways=None)
+        monkeypatch.setitem(sys.modules, "planner_ompl", ModuleType("planner_ompl"))
+        monkeypatch.setitem(sys.modules, "planner_ompl.method", ompl)
+    program = outside(name)
+    assert len(program.chosen([])) > 1
+    monkeypatch.setattr(sys, "argv", [name, "laikago_fly"])
+    assert program.main() == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"{name}: unknown ")
+    assert error.count("\n") == 1
