@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,6 +41,7 @@ from tsbench.viewer.paper.exhibit import (
     solves,
 )
 
+ROOT = Path(__file__).parents[2]
 ROCKET = "rocket_navigation"
 Invented = Callable[[str], Record]
 
@@ -328,6 +331,46 @@ def test_a_folder_of_figures_is_complete_and_needs_nothing_else(
     assert "what came out" in text
     with pytest.raises(TsbenchError, match="nothing is overwritten: give another by --out DIR"):
         page.write(found, out)
+
+
+@pytest.fixture(name="puck")
+def puck_fixture(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The module of a plug-in's task that has neither feet nor a flat, bounded world."""
+    monkeypatch.setattr(
+        tasks, "_factories", {name: tasks._factories[name] for name in tasks.names()}
+    )
+    monkeypatch.syspath_prepend(ROOT / "examples" / "planar-puck")
+    yield importlib.import_module("planar_puck.task")
+    for name in ("planar_puck.task", "planar_puck"):
+        del sys.modules[name]
+
+
+def test_a_task_of_a_plug_in_has_the_figures_that_it_can_have(
+    tmp_path: Path, make: Callable[..., Result], make_run: Callable[..., Path], puck: Any
+) -> None:
+    """Its words may have what TeX would read."""
+
+    def of_puck(row: Result) -> Result:
+        words = ("task=puck_gap", *row.words[1:])
+        score = replace(row.score, origin=replace(row.score.origin, task="puck_gap"))
+        return replace(row, task="puck_gap", words=words, score=score)
+
+    rows = [of_puck(make(method, 0, 0.1)) for method in (OURS, PRM)]
+    rows.append(of_puck(make(PRM, 0, 0.1, 1.0, "method.note='$\\no_such_word$'")))
+    found = of(rows)
+    for number, row in enumerate(rows[:2]):
+        run = make_run("puck_gap", directory=f"run{number}")
+        found.folders[row.words] = RunDirectory(run)
+    page.write(found, tmp_path / "out")
+    names = {path.stem for path in (tmp_path / "out").glob("*.png")}
+    assert names == {"scores", "survival_puck_gap"}
+    footed = replace(puck.PuckGap().drawing(), feet=("left",))
+    strange = type("Strange", (puck.PuckGap,), {"drawing": lambda _: footed})()
+    assert not list(plans.exhibits(found, grouped(found.groups()), {"puck_gap": strange}))
+    (group,) = grouped(of(rows[:1]).groups())
+    way = plans.way(strange, naive_plan(strange), group, 0)
+    assert 2.0 < way.length < 3.0  # through the gap
+    assert way.path[-1] == pytest.approx([2.0, 0.0, 0.1], abs=0.2)
 
 
 def test_the_commands_keep_a_run_and_draw_it_with_a_strip(

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tsbench import cli, tasks
@@ -15,7 +16,8 @@ from tsbench.core.errors import TsbenchError
 from tsbench.core.motion import Plan
 from tsbench.evaluation.protocol import V1
 from tsbench.runs.directory import Record, RunDirectory, Stage
-from tsbench.viewer import curves, report
+from tsbench.viewer import charts, curves, report
+from tsbench.viewer.show import PLAN_COLOUR
 
 MakeRun = Callable[..., Path]
 BOARD = Path(__file__).parents[2] / "leaderboards" / "v1"
@@ -166,6 +168,11 @@ def test_the_command_writes_it_beside_the_run(
     assert "nothing is overwritten: give another by --html FILE" in capsys.readouterr().err
     assert cli.main(["report", str(run), "--html", "report.png"]) == 2
     assert capsys.readouterr().err == "tsbench: report.png must end in .html\n"
+
+
+def test_names_are_no_formulas() -> None:
+    line = ("plan", PLAN_COLOUR, np.arange(2.0), np.arange(2.0))
+    assert "$\\no_such_word$" in charts._panel("x", "$\\no_such_word$", [line])
 
 
 def test_what_does_not_belong_to_the_run_is_refused(

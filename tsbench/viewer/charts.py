@@ -28,6 +28,7 @@ TEXT_COLOUR = (
 )
 STYLE = {
     "svg.fonttype": "none",  # keeps text as text, which can be searched
+    "text.parse_math": False,  # names may have a $
     "font.family": "sans-serif",
     "font.size": LINE,
     "axes.spines.top": False,

@@ -16,9 +16,11 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from tsbench.core.task import Task
 from tsbench.core.words import several
 from tsbench.evaluation.statistics import PROVISIONAL_SEEDS, Difference, paired_difference
 from tsbench.runs.results import Result, Results
+from tsbench.viewer.scene import Array, body_poses
 
 # The paper's methods, by the names that they have here. They stand here and not beside each method,
 # because the figures tell what the paper claims of these four, most often of two of them together.
@@ -42,6 +44,7 @@ STYLE = {
     "axes.grid": False,
     "legend.frameon": False,
     "svg.fonttype": "none",  # text stays text
+    "text.parse_math": False,  # names and words may have a $
     "svg.hashsalt": "tsbench",
 }
 ENOUGH = 0.95  # share of the perturbed starts that a seed has to solve to succeed
@@ -311,6 +314,12 @@ def by_task(groups: Sequence[Group]) -> Mapping[str, list[Group]]:
     for group in sorted(groups, key=lambda group: group.task):
         found.setdefault(group.task, []).append(group)
     return found
+
+
+def base_path(task: Task[Any], qpos: Array) -> Array:
+    """Positions of the robot's base at poses (n, nq): world frame in metres, shape (n, 3)."""
+    model = task.spec().compile()
+    return body_poses(model, qpos)[0][:, model.body(task.pushed).id]
 
 
 def tidy(panel: Axes) -> None:

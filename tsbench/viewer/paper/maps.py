@@ -17,6 +17,7 @@ from tsbench.viewer.paper.exhibit import (
     Exhibit,
     Group,
     Verdict,
+    base_path,
     best_at_hand,
     drawing,
     main_group,
@@ -36,7 +37,8 @@ def exhibits(results: Results, groups: Sequence[Group]) -> Iterator[Exhibit]:
             continue
         run = results.folders[best.words]
         task = run.task(task_name)
-        if isinstance(task, Plannable) and task.drawing().still is not None:
+        drawn = task.drawing()
+        if isinstance(task, Plannable) and drawn.still is not None and drawn.bounds is not None:
             plan = run.plan(task)
             if plan is not None:
                 yield _exhibit(task, task.reference(plan), best.seed)
@@ -44,10 +46,10 @@ def exhibits(results: Results, groups: Sequence[Group]) -> Iterator[Exhibit]:
 
 def _exhibit(task: Plannable[Any], reference: ReferenceMotion, seed: int) -> Exhibit:
     x, z, grid = _grid(task)
-    path = reference.qpos[:, :2]
+    along = base_path(task, reference.qpos)
+    path = along[:, [0, 2]]
     names = ["reward R", *(f"imitation, {form}" for form in task.imitation_forms)]
     maps = [_worth(task, grid, reference, form) for form in (None, *task.imitation_forms)]
-    along = np.stack([path[:, 0], np.zeros(len(path)), path[:, 1]], axis=-1)
     lengths = np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1)
     felt = {
         name: float(
@@ -75,8 +77,8 @@ def _exhibit(task: Plannable[Any], reference: ReferenceMotion, seed: int) -> Exh
         name=f"heatmap_{task.name}",
         title=f"Reward of {task.name}, and its imitation rewards",
         note=f"The dashed line is the plan of seed {seed}, which is imitated; the dot its start. A "
-        "rocket at rest is rewarded at each place; what moving on along the plan earns is left "
-        "out.",
+        f"{task.drawing().robot} at rest is rewarded at each place; what moving on along the plan "
+        "earns is left out.",
         figure=figure,
         claims=tuple(_claims(task.name, names, maps[0], felt)),
         columns=columns,

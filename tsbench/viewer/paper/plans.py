@@ -19,13 +19,14 @@ from tsbench.viewer.paper.exhibit import (
     Exhibit,
     Group,
     Verdict,
+    base_path,
     by_task,
     drawing,
     papers_group,
     tidy,
 )
 from tsbench.viewer.scene import Array
-from tsbench.viewer.show import Actor, track
+from tsbench.viewer.show import landmarks
 
 ARRIVED = 0.05  # m, nearer than this to where a plan comes nearest to its goal it has arrived
 
@@ -58,10 +59,11 @@ class Way:
 def exhibits(
     results: Results, groups: Sequence[Group], tasks: dict[str, Task]
 ) -> Iterator[Exhibit]:
-    """One for each task of which there are plans at hand."""
+    """One for each task of which there are plans at hand, and which has footsteps or a flat world
+    to draw them in."""
     for name, members in by_task(groups).items():
         task = tasks[name]
-        if not isinstance(task, Plannable):
+        if not isinstance(task, Plannable) or not (has_steps(task) or has_map(task)):
             continue
         ways: dict[Group, list[Way]] = {}
         for group in members:
@@ -74,12 +76,23 @@ def exhibits(
             yield _exhibit(task, ways)
 
 
+def has_steps(task: Plannable[Any]) -> bool:
+    """Whether plans for the task say where each foot is, and which of them stand."""
+    coordinates = task.abstraction().coordinates
+    feet = task.drawing().feet
+    told = all(f"{foot}_x" in coordinates for foot in feet)
+    return bool(feet) and told and {"feet", "contacts"} <= task.tracked.keys()
+
+
+def has_map(task: Task) -> bool:
+    """Whether the task's world is bounded, and so flat across y (`viewer.stage`)."""
+    return task.drawing().bounds is not None
+
+
 def way(task: Plannable[Any], plan: Plan, group: Group, seed: int) -> Way:
-    model = task.spec().compile()
-    poses = task.abstraction().poses(plan.states)
-    body = model.body(task.pushed).id
-    path = track(model, Actor("plan", poses, plan.timestep, (0, 0, 0), "")).positions[:, body]
-    away = np.linalg.norm(path - model.site("goal").pos, axis=-1)
+    path = base_path(task, task.abstraction().poses(plan.states))
+    marks = {mark.text: mark.position for mark in landmarks(task.spec().compile())}
+    away = np.linalg.norm(path - marks.get("goal", path[-1]), axis=-1)
     flight = path[: max(int(np.argmax(away < away.min() + ARRIVED)), 2) + 1]
     moves = np.linalg.norm(np.diff(flight, axis=0), axis=-1)
     acceleration = np.diff(flight, n=2, axis=0) / plan.timestep**2
@@ -100,9 +113,8 @@ def way(task: Plannable[Any], plan: Plan, group: Group, seed: int) -> Way:
 
 
 def _exhibit(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Exhibit:
-    drawn = task.drawing()
-    planar = drawn.bounds is not None
-    height = 0.4 + len(ways) * (3.4 if planar else 2.1)
+    steps = has_steps(task)
+    height = 0.4 + len(ways) * (2.1 if steps else 3.4)
     with drawing(height) as figure:
         panels = figure.subplots(len(ways), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
         for panel, (group, members) in zip(panels, ways.items(), strict=True):
@@ -112,16 +124,16 @@ def _exhibit(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Exhibit:
                 f"{group.label}: {roughness:.1f} m/s\u00b2, {turning:.2f} rad/m",
                 loc="left", color=group.colour,
             )  # fmt: skip
-            if planar:
-                _draw_paths(panel, task, members)
-            else:
+            if steps:
                 _draw_feet(panel, task, members[0])
+            else:
+                _draw_paths(panel, task, members)
             tidy(panel)
-        panels[-1].set_xlabel("x, m" if planar else "time, s")
+        panels[-1].set_xlabel("time, s" if steps else "x, m")
     what = (
-        "The plans of the seeds at hand."
-        if planar
-        else "Where each foot of the first seed's plan is along the way: level while it stands."
+        "Where each foot of the first seed's plan is along the way: level while it stands."
+        if steps
+        else "The plans of the seeds at hand."
     )
     return Exhibit(
         name=f"plans_{task.name}",
@@ -144,16 +156,12 @@ def _exhibit(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Exhibit:
 
 
 def _draw_paths(panel: Any, task: Plannable[Any], members: Sequence[Way]) -> None:
-    model = task.spec().compile()
     for one in members:
         panel.plot(one.path[:, 0], one.path[:, 2], color=one.group.colour, lw=1.3, alpha=0.8)
-    for index in range(model.ngeom):
-        name = model.geom(index).name
-        if name.startswith("obstacle"):
-            x, _, z = model.geom_pos[index]
-            panel.plot(x, z, "s", color="black", ms=6)
-    x, _, z = model.site("goal").pos
-    panel.plot(x, z, "*", color="black", ms=11, clip_on=False)
+    for mark in landmarks(task.spec().compile()):
+        x, _, z = mark.position
+        shape, size = ("*", 11) if mark.text == "goal" else ("s", 6)
+        panel.plot(x, z, shape, color="black", ms=size, clip_on=shape == "s")
     panel.set(aspect="equal", ylabel="z, m")
 
 
@@ -161,19 +169,18 @@ def _draw_feet(panel: Any, task: Plannable[Any], one: Way) -> None:
     names = task.abstraction().coordinates
     shades = ("-", "--", "-.", ":")
     for foot, dashes in zip(task.drawing().feet, shades, strict=False):
-        if f"{foot}_x" in names:
-            column = one.plan.states[:, names.index(f"{foot}_x")]
-            panel.plot(
-                one.plan.times, column, dashes, color=one.group.colour, lw=1.2,
-                label=foot.removesuffix("_foot"),
-            )  # fmt: skip
+        column = one.plan.states[:, names.index(f"{foot}_x")]
+        panel.plot(
+            one.plan.times, column, dashes, color=one.group.colour, lw=1.2,
+            label=foot.removesuffix("_foot"),
+        )  # fmt: skip
     panel.set(ylabel="x of each foot, m")
     panel.legend(ncols=4, loc="upper left", fontsize=9)
 
 
 def _claims(task: Plannable[Any], ways: dict[Group, list[Way]]) -> Iterator[Claim]:
-    """Of a planar task how smooth its plans are, of one with feet how regular its footsteps."""
-    if task.drawing().bounds is None:
+    """Of a task with footsteps how regular they are, of another one how smooth its plans."""
+    if has_steps(task):
         yield from _regular(task, ways)
     else:
         yield from _smoother(task.name, ways)
