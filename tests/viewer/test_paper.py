@@ -351,6 +351,7 @@ def test_a_task_of_a_plug_in_has_the_figures_that_it_can_have(
     """Its words may have what TeX would read."""
 
     def of_puck(row: Result) -> Result:
+        assert row.score is not None
         words = ("task=puck_gap", *row.words[1:])
         score = replace(row.score, origin=replace(row.score.origin, task="puck_gap"))
         return replace(row, task="puck_gap", words=words, score=score)

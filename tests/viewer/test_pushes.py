@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import pytest
 from tsbench import tasks
 from tsbench.core.errors import TsbenchError
 from tsbench.sim.push import direction
-from tsbench.viewer.pushes import parse_push
+from tsbench.viewer.pushes import headings, parse_push, push_in_words
 from tsbench.viewer.subject import pair, subject
 
 WALK = tasks.make("laikago_walk")
@@ -45,6 +47,29 @@ def test_a_push_stays_in_the_plane_that_scores_push_in() -> None:
         parse_push("9N@1s:+y", rocket)
     with pytest.raises(TsbenchError, match=r"allowed are \+x, -x, \+y, -y or an angle"):
         parse_push("9N@1s:+z", WALK)
+
+
+def test_headings_follow_the_axes_of_the_plane() -> None:
+    """Whatever their order; an axis that is none of the world's is told as a vector."""
+
+    def pushed(*plane: tuple[float, float, float]) -> Any:
+        return cast(Any, SimpleNamespace(pushed="robot", push_plane=plane))
+
+    x, y, z = (0.6, 0.8, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    assert list(headings(WALK).items())[:3] == [("+x", "ahead"), ("-x", "back"), ("+y", "left")]
+    turned = pushed(y, (-1.0, 0.0, 0.0))
+    assert list(headings(turned).items())[::2] == [("+y", "left"), ("-x", "back")]
+    oblique = pushed(x, z)
+    assert list(headings(oblique).items()) == [
+        ("0", "along (0.6, 0.8, 0)"), ("180", "along (-0.6, -0.8, 0)"), ("+z", "up"), ("-z", "down")
+    ]  # fmt: skip
+    for heading in headings(oblique):
+        parse_push(f"9N@1s:{heading}", oblique)
+    assert push_in_words(parse_push("9N@1s:0", oblique), oblique) == "9 N at 0 degrees at 1 s"
+    with pytest.raises(TsbenchError, match=r"leaves the plane .* allowed are \+z, -z or an angle"):
+        parse_push("9N@1s:+x", oblique)
+    with pytest.raises(TsbenchError, match="allowed are an angle"):
+        parse_push("9N@1s:+x", pushed(x, (0.48, -0.36, 0.8)))
 
 
 @pytest.mark.parametrize(

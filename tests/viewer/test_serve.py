@@ -55,6 +55,7 @@ def test_a_page_with_or_without_a_push() -> None:
     with running(render) as url:
         assert fetch(url) == (200, "<p>None</p>")
         assert fetch(f"{url}?push=100N%400.5s%3A%2By") == (200, "<p>100N@0.5s:+y</p>")
+        assert fetch(f"{url}?push=100N@0.5s:+y") == (200, "<p>100N@0.5s:+y</p>")
         assert fetch(f"{url}?push=bad") == (400, "cannot read the push 'bad'")
         assert fetch(f"{url}favicon.ico")[0] == 404
 
@@ -68,6 +69,21 @@ def test_other_sites_cannot_order_pages() -> None:
                 urllib.request.urlopen(asked, timeout=60)
         same = urllib.request.Request(url, headers={"Sec-Fetch-Site": "same-origin"})
         assert urllib.request.urlopen(same, timeout=60).status == 200
+
+
+def test_the_address_of_a_push_with_spaces() -> None:
+    with running(render) as url, serve.server(render, 0) as other:
+        asked = serve.address(other, "9N @ 1s : +y").partition("?")[2]
+        assert fetch(f"{url}?{asked}") == (200, "<p>9N @ 1s : +y</p>")
+
+
+def test_browsers_leave_out_the_port_of_http(monkeypatch: pytest.MonkeyPatch) -> None:
+    with running(render) as url:
+        asked = urllib.request.Request(url, headers={"Host": "127.0.0.1"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(asked, timeout=60)
+        monkeypatch.setattr(serve, "HTTP_PORT", int(url.split(":")[2].strip("/")))
+        assert urllib.request.urlopen(asked, timeout=60).status == 200
 
 
 def test_one_page_for_all_who_ask_at_once() -> None:

@@ -193,7 +193,7 @@ def _sections(
     assert subject.score is not None
     duration = max(r.duration for r in (recording, plan) if r is not None)
     robot = subject.task.drawing().robot
-    ahead, across = (words for axis, words in headings(subject.task).items() if axis[0] == "+")
+    first, _, second, _ = headings(subject.task).values()
     if recording.task.drawing().feet:
         bands = foot_bands(plan or recording, recording)
         yield _section(
@@ -224,7 +224,7 @@ def _sections(
         charts.robustness(
             subject.score.score.robustness.surface,
             subject.task.timestep,
-            f"0 {ahead}, 90 {across}",
+            f"0 {first}, 90 {second}",
         ),
     )
     if run.begun:

@@ -16,11 +16,12 @@ from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
-from urllib.parse import parse_qs, urlencode, urlsplit
+from urllib.parse import parse_qs, quote, urlencode, urlsplit
 
 from tsbench.core.errors import TsbenchError
 
 HOST = "127.0.0.1"  # other machines cannot connect
+HTTP_PORT = 80  # which browsers leave out of the Host header
 KEPT = 8  # pages kept in memory, so that reloading one is quick
 WAITING = 8  # requests that may wait for a page
 
@@ -56,6 +57,8 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
         def _foreign(self) -> str:
             """Why the request is another site's, or "" if it is none."""
             names = [f"{name}:{listening.server_port}" for name in (HOST, "localhost")]
+            if listening.server_port == HTTP_PORT:
+                names += [HOST, "localhost"]
             if self.headers.get("Host") not in names:
                 return f"this server is {names[0]}"
             asker = self.headers.get("Sec-Fetch-Site", "none")
@@ -66,7 +69,8 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
             if asked.path != "/":
                 self._answer(HTTPStatus.NOT_FOUND, "text/plain", "there is only one page: /")
                 return
-            push = parse_qs(asked.query).get("push", [None])[0]
+            # A plus sign is one, as in +y, and not a space as in the words of forms.
+            push = parse_qs(asked.query.replace("+", "%2B")).get("push", [None])[0]
             try:
                 with rendering:  # who asks for the same page meanwhile finds it made
                     page = kept(push)
@@ -107,5 +111,5 @@ def server(render: Render, port: int) -> ThreadingHTTPServer:
 
 def address(running: ThreadingHTTPServer, push: str | None) -> str:
     """The address of the page."""
-    query = f"?{urlencode({'push': push})}" if push else ""
+    query = f"?{urlencode({'push': push}, quote_via=quote)}" if push else ""
     return f"http://{HOST}:{running.server_address[1]}/{query}"
