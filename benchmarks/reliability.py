@@ -5,9 +5,9 @@
 trains `budget=fast` with seeds 0 to 9, each as it is and with initial weights that differ by one
 millionth, which stands for another processor (`tsbench.testing.rounding`). All of the words of
 `tsbench run` but seed are allowed. A training succeeds when its last policy solves at least 95 of
-the protocol's 100 perturbed starts. A plan that fails its audit is a training that fails. The file
-gets a line for each training as it ends. Trainings that it has are not repeated, so that an
-interrupted study goes on. The table is made from the file.
+the protocol's 100 perturbed starts. A plan that fails its audit is a training that fails, and so
+are numbers that are not finite. The file gets a line for each training as it ends. Trainings that
+it has are not repeated, so that an interrupted study goes on. The table is made from the file.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tsbench import methods
-from tsbench.core.errors import PlanError, TsbenchError
+from tsbench.core.errors import NotFiniteError, PlanError, TsbenchError
 from tsbench.evaluation.evaluate import evaluate
 from tsbench.evaluation.protocol import V1
 from tsbench.rl.threads import one_thread
@@ -54,14 +54,14 @@ def train(words: list[str], seed: int, rounding: float) -> dict[str, Any]:
         workspace = RunWorkspace(Path(folder), Console(quiet=True))
         try:
             policy = methods.find(chosen.method["name"]).train(problem, workspace)
-        except PlanError as refused:
+            seconds = time.perf_counter() - began
+            score = evaluate(policy, problem.task, protocol=PROTOCOL, threads=1)
+        except (PlanError, NotFiniteError) as refused:
             sys.stderr.write(f"seed {seed}, rounding {rounding:g}: {refused}\n")
             nothing = ("solved", "solved_reward", "normalized_reward", "survival_100N")
             return {**row, **dict.fromkeys(nothing, 0.0), "seconds": time.perf_counter() - began}
         finally:
             workspace.close()
-        seconds = time.perf_counter() - began
-        score = evaluate(policy, problem.task, protocol=PROTOCOL, threads=1)
     return {
         **row,
         "solved": score.perturbed.success,
@@ -100,21 +100,28 @@ def main() -> int:
     rows = [row for row in map(json.loads, lines) if row["words"] == options.words]
     done = {(row["seed"], row["rounding"]) for row in rows}
     wanted = [(s, r) for s in range(options.seeds) for r in options.rounding if (s, r) not in done]
+    broken = 0
     try:
         prepare(config.compose(options.words))
         # Fresh processes: a fork would share what torch has started.
         with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
             jobs = [pool.submit(train, options.words, *one) for one in wanted]
             for job in as_completed(jobs):
-                rows.append(job.result())
+                try:
+                    rows.append(job.result())
+                except TsbenchError as error:  # the others go on
+                    broken += 1
+                    sys.stderr.write(f"reliability: {error}\n")
+                    continue
                 with options.out.open("a") as file:
                     file.write(json.dumps(rows[-1]) + "\n")
                 sys.stderr.write(f"{len(rows)}: {rows[-1]}\n")
     except TsbenchError as error:
         sys.stderr.write(f"reliability: {error}\n")
         return 2
-    Console().print(table(rows))
-    return 0
+    if rows:
+        Console().print(table(rows))
+    return 1 if broken else 0
 
 
 if __name__ == "__main__":

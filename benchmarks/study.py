@@ -120,6 +120,7 @@ class Study:
         self.waiting = deque(job for job in jobs if job.words not in rows)
         self.running: list[Training] = []
         self.failed = 0
+        self._stopping = False
         self._out = out
         self._total = len(jobs)
         self._began = time.monotonic()
@@ -145,6 +146,7 @@ class Study:
         Raises:
             TsbenchError: a result cannot be kept.
         """
+        self._stopping = True
         for training in self.running:
             training.process.send_signal(signal.SIGTERM)
         for training in self.running:
@@ -185,11 +187,14 @@ class Study:
         if self._collect(job, f"after {duration(seconds)}"):
             return
         status = training.process.returncode
-        if status > 128 or status < 0:
+        if self._stopping and status in (128 + signal.SIGTERM, -signal.SIGTERM):
             self._tell(f"stopped: {' '.join(job.words)}")
-        else:
-            self.failed += 1
-            self._tell(f"failed: {' '.join(job.words)}: {lines[-1] if lines else status}")
+            return
+        why = lines[-1] if lines else f"status {status}"
+        if status < 0:  # such as SIGKILL, where memory runs out
+            why = f"killed by {signal.Signals(-status).name}"
+        self.failed += 1
+        self._tell(f"failed: {' '.join(job.words)}: {why}")
 
     def _collect(self, job: Job, when: str) -> bool:
         """Keeps the result of a run. Returns whether there is one."""

@@ -3,16 +3,18 @@ keeps; and what a mistake in a call of the others does."""
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
+from io import BytesIO
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 
-from tsbench.core.errors import TsbenchError
+from tsbench.core.errors import NotFiniteError, TsbenchError
 from tsbench.core.files import write_json
 from tsbench.runs import results
 from tsbench.runs.directory import RunDirectory
@@ -91,6 +93,47 @@ def test_the_table_of_reliability_counts_it_too(capsys: pytest.CaptureFixture[st
     row = RELIABILITY.train(NO_WAY.split(), 0, 0.0)
     assert (row["solved"], row["solved_reward"], row["normalized_reward"]) == (0.0, 0.0, 0.0)
     assert "seed 0, rounding 0: the roadmap of 0 samples has no way" in capsys.readouterr().err
+
+
+def test_a_number_that_is_not_finite_is_a_training_that_failed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(*_: object) -> None:
+        raise NotFiniteError("the reward is not finite", {})
+
+    found = SimpleNamespace(find=lambda _: SimpleNamespace(train=train))
+    monkeypatch.setattr(RELIABILITY, "methods", found)
+    assert RELIABILITY.train(SMALL.split(), 3, 0.0)["solved"] == 0.0
+    assert "seed 3, rounding 0: the reward is not finite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stopping", "status", "told"),
+    [
+        (True, 128 + signal.SIGTERM, "stopped: "),
+        (False, 128 + signal.SIGTERM, "failed: "),
+        (True, -signal.SIGKILL, "failed: "),  # as by a lack of memory
+    ],
+)
+def test_a_training_that_is_killed_has_failed(
+    stopping: bool,
+    status: int,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("study.txt").write_text(f"{NO_WAY} seed=0")
+    (job,) = STUDY.read_jobs(Path("study.txt"))
+    ended = STUDY.Training(job, SimpleNamespace(returncode=status), BytesIO(), 0.0)
+    study = STUDY.Study([job], Path("kept"))
+    study._stopping = stopping
+    study._finish(ended)
+    assert study.failed == (told == "failed: ")
+    said = capsys.readouterr().out
+    assert told in said
+    assert (status > 0) or said.endswith("killed by SIGKILL\n")
 
 
 def test_a_mistake_in_a_study_is_told_before_anything_runs(study: Study) -> None:
