@@ -64,7 +64,8 @@ def board() -> tuple[list[Table], list[str]]:
 
 
 def write_pages(folder: Path) -> list[Path]:
-    """Writes the cards and the board's tables below a folder, and returns the files."""
+    """Writes the cards and the board's tables below a folder, in place of earlier ones, and returns
+    the files."""
     found, left_out = board()
     before = (
         "# The board\n\nAll entries of `leaderboards/v1`, best first, with the policies `zero` and "
@@ -79,7 +80,10 @@ def write_pages(folder: Path) -> list[Path]:
         path.parent.mkdir(exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             write_whole(path, text.encode())
-    return [folder / name for name in pages]
+    written = [folder / name for name in pages]
+    for path in {*folder.glob("tasks/*.md"), *folder.glob("methods/*.md")}.difference(written):
+        path.unlink()  # of a task or method that is gone
+    return written
 
 
 # Cards

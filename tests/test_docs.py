@@ -407,6 +407,9 @@ def cards() -> ModuleType:
 
 
 def test_each_task_and_method_has_a_card(tmp_path: Path) -> None:
+    for kind in ("tasks", "methods"):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / "gone.md").touch()
     cards().write_pages(tmp_path)
     assert {path.stem for path in (tmp_path / "tasks").iterdir()} == set(tasks.names())
     assert {path.stem for path in (tmp_path / "methods").iterdir()} == set(methods.names())

@@ -175,3 +175,5 @@ def test_compare_kept_entries(
     assert cli.main(["compare", *map(str, bare), "--png", "x.png"]) == 2
     assert "none of these has its metrics.jsonl" in capsys.readouterr().err
     assert not (tmp_path / "x.png").exists()
+    assert cli.main(["compare", str(kept), "--png", "x.pdf"]) == 2
+    assert capsys.readouterr().err == "tsbench: x.pdf must end in .png\n"

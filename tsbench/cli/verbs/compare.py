@@ -28,10 +28,12 @@ def call(words: Sequence[str]) -> None:
     from rich.console import Console
 
     from tsbench.cli import tables
-    from tsbench.core.files import write_json, write_new
+    from tsbench.core.files import check_ending, write_json, write_new
     from tsbench.runs import results
     from tsbench.viewer import comparison
 
+    if options.png:
+        check_ending(options.png, ".png")
     found = {word: results.read([places.entry(word)]) for word in options.runs}
     parts = _told_apart(found)
     everything = results.Results()

@@ -16,12 +16,12 @@ from tsbench import tasks
 from tsbench.core.errors import TsbenchError, os_errors
 from tsbench.core.files import taken, write_new
 from tsbench.core.words import command
-from tsbench.runs.results import Results
+from tsbench.runs.results import CONSTANTS, Results
 from tsbench.viewer.page import fill
 from tsbench.viewer.paper import ladder, learning, maps, plans, scores, strips, surfaces
 from tsbench.viewer.paper.exhibit import DPI, STYLE, Exhibit, Group, grouped
 
-DISTANCE = "task.constants.distance="  # the constant that a ladder changes
+DISTANCE = f"{CONSTANTS}distance="  # the constant that a ladder changes
 
 
 def write(results: Results, out: Path) -> tuple[list[scores.Line], list[str]]:
@@ -80,7 +80,7 @@ def write(results: Results, out: Path) -> tuple[list[scores.Line], list[str]]:
 
 def _is_rung(group: Group) -> bool:
     """Whether nothing but the goal's distance differs from the standard task."""
-    changed = [word for word in group.first.words if word.startswith("task.constants.")]
+    changed = [word for word in group.first.words if word.startswith(CONSTANTS)]
     return all(word.startswith(DISTANCE) for word in changed)
 
 

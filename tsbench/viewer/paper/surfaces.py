@@ -127,11 +127,12 @@ def _claims(scored: dict[Group, list[tuple[Result, Surface]]]) -> Iterator[Claim
             continue
         scores: list[Score] = [row.score for row, _ in surfaces if row.score]
         force, name = claim_force(scores[0]), scores[0].origin.task
+        seconds = scores[0].robustness.push_duration_s
         survived = [score.robustness.survival_100N for score in scores]
         recovered = float(np.mean([score.robustness.recovery_100N for score in scores]))
         yield Claim(
             "The policy endures forces of up to 100 N for 0.1 s (said of the walk).",
-            f"{name}: of pushes of {force:.3g} N for 0.1 s {group.label} survives "
+            f"{name}: of pushes of {force:.3g} N for {seconds:g} s {group.label} survives "
             f"{np.mean(survived):.1%} (seeds {min(survived):.1%} to {max(survived):.1%}), and "
             f"solves the task after {recovered:.1%}",
             Verdict.of(min(survived) == 1.0),
