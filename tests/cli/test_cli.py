@@ -250,18 +250,22 @@ def test_a_run_whose_pages_fail_still_writes_its_json(
 
 def test_interrupted(tmp_path: Path) -> None:
     words = ["run", TASK, "directory=mine"]
-    process = subprocess.Popen(
+    metrics = tmp_path / "mine" / "metrics.jsonl"
+    patience = 300.0  # s, on a busy machine
+    with subprocess.Popen(
         [sys.executable, "-m", "tsbench", *words],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    metrics = tmp_path / "mine" / "metrics.jsonl"
-    deadline = time.monotonic() + 300.0  # on a busy machine
-    while not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    ) as process:
+        try:
+            deadline = time.monotonic() + patience
+            while not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < deadline:
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=patience)
+        finally:
+            process.kill()  # otherwise the end of the context waits for it
     line = "tsbench: interrupted; to go on: tsbench run resume=mine\n"
     assert (process.returncode, errors) == (130, line)
     assert not (tmp_path / "mine" / "score.json").exists()

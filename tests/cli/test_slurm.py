@@ -15,6 +15,24 @@ WORDS = [
     "task.budgets.smoke.act=20480",
 ]  # fmt: skip
 
+# The command. With HELD it waits in its second iteration for the signal that interrupts it.
+TSBENCH = """
+import os, sys, time
+from tsbench import cli
+from tsbench.runs.workspace import RunWorkspace
+
+def held(self, *row):
+    record(self, *row)
+    rows.append(row)
+    while len(rows) == 2 and self._stopped_by is None:
+        time.sleep(0.01)
+
+rows, record = [], RunWorkspace.record
+if "HELD" in os.environ:
+    RunWorkspace.record = held
+sys.exit(cli.main())
+"""
+
 # Starts the tasks of an array one after the other, and interrupts the first start of each while it
 # trains: task 0 by SIGTERM to the shell, as near the time limit, task 1 by the death of its node.
 SBATCH = """
@@ -31,6 +49,10 @@ for task in range(first, last + 1):
         "SLURM_ARRAY_TASK_ID": str(task), "SLURM_JOB_ID": job, "SLURM_CPUS_PER_TASK": "1"
     }
     for start in range(3):
+        if start == 0:
+            environment["HELD"] = "yes"
+        else:
+            environment.pop("HELD", None)
         shell = subprocess.Popen(["bash", script, *words], env=environment, start_new_session=True)
         if start == 0:
             until = time.monotonic() + 300
@@ -38,7 +60,7 @@ for task in range(first, last + 1):
                 found = pathlib.Path("runs").glob(f"*/*/seed{task}-*/metrics.jsonl")
                 if any(path.read_bytes().count(b"\\n") > 1 for path in found):  # a checkpoint too
                     break
-                time.sleep(0.01)
+                time.sleep(0.1)
             if task == 0:
                 shell.send_signal(signal.SIGTERM)
             else:
@@ -61,7 +83,7 @@ def test_an_array_that_is_interrupted(tmp_path: Path) -> None:
     same bits as a run that was left alone."""
     programs = tmp_path / "bin"
     programs.mkdir()
-    program(programs / "tsbench", f'#!/bin/sh\nexec "{sys.executable}" -m tsbench "$@"\n')
+    program(programs / "tsbench", f"#!{sys.executable}{TSBENCH}")
     program(programs / "scontrol", '#!/bin/sh\ntest "$1" = requeue && touch "requeue-$2"\n')
     program(programs / "sbatch", f"#!{sys.executable}{SBATCH}")
     environment = os.environ | {

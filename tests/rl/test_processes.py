@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,18 +59,19 @@ def both(arguments: list[str], folder: Path) -> list[subprocess.CompletedProcess
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    started = []
-    for rank in range(2):
-        places = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "MASTER_PORT": port}
-        environment = {**os.environ, "MASTER_ADDR": "127.0.0.1"}
-        environment |= {name: str(value) for name, value in places.items()}
-        started.append(
-            subprocess.Popen(
+    started: list[subprocess.Popen[str]] = []
+    with ExitStack() as ends:
+        for rank in range(2):
+            places = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "MASTER_PORT": port}
+            environment = {**os.environ, "MASTER_ADDR": "127.0.0.1"}
+            environment |= {name: str(value) for name, value in places.items()}
+            process = subprocess.Popen(
                 [sys.executable, *arguments], cwd=folder, env=environment, text=True,
                 stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            )
-        )  # fmt: skip
-    outputs = [process.communicate(timeout=600) for process in started]
+            )  # fmt: skip
+            started.append(ends.enter_context(process))
+            ends.callback(process.kill)  # before its context waits for it
+        outputs = [process.communicate(timeout=600) for process in started]
     return [
         subprocess.CompletedProcess(arguments, process.returncode, *output)
         for process, output in zip(started, outputs, strict=True)
