@@ -266,8 +266,12 @@ def test_no_other_file_is_touched(tmp_path: Path) -> None:
     film.write_strip(shown, tmp_path / "x.png", 1)
     assert set(tmp_path.iterdir()) - before == {tmp_path / "x.mp4", tmp_path / "x.png"}
     late = tmp_path / "late.mp4"
+
+    def appear(_: float) -> None:
+        late.write_text("mine")
+
     with pytest.raises(TsbenchError, match=r"late\.mp4 exists and nothing is overwritten"):
-        film.write_video(shown, late, lambda _: late.write_text("mine") and None)
+        film.write_video(shown, late, appear)
     assert mine.read_text() == late.read_text() == "mine"
 
 
