@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -21,6 +22,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tsbench import methods, tasks
 from tsbench.rl.stages import ImitationOptions
 
 ROOT = Path(__file__).parents[1]
@@ -43,10 +45,11 @@ def commands(title: str) -> list[str]:
 
 
 def files() -> Iterator[str]:
+    """All but README.md, which leads to the guide."""
     for path in sorted(EXAMPLE.rglob("*")):
         parts = path.relative_to(EXAMPLE).parts
         made = any(part.startswith((".", "__pycache__", "dist", "build")) for part in parts)
-        if path.is_file() and not made:
+        if path.is_file() and not made and path.name != "README.md":
             yield "/".join(parts)
 
 
@@ -63,6 +66,26 @@ def test_the_guide_shows_the_file(name: str) -> None:
     for piece in shown:
         assert f"\n{piece}" in f"\n{source}"
     assert written("".join(shown)) == written(source)
+
+
+@pytest.mark.parametrize(
+    "folder", sorted((ROOT / "examples").iterdir()), ids=lambda path: path.name
+)
+def test_the_page_of_an_example_names_what_there_is(folder: Path) -> None:
+    """The tasks and methods of its command, the way to install it, and the guide."""
+    text, project = (folder / "README.md").read_text("utf-8"), folder / "pyproject.toml"
+    offers: dict[str, dict[str, str]] = {}
+    if project.exists():
+        assert f"pip install ./examples/{folder.name}\n" in text
+        offers = tomllib.loads(project.read_text())["project"]["entry-points"]
+    for kind, known in (("task", tasks.names()), ("method", methods.names())):
+        own = offers.get(f"tsbench.{kind}s", {})
+        named = set(re.findall(rf"\b{kind}=(\w+)", text))
+        assert named
+        assert named <= {*known, *own}
+        assert named & own.keys() or not own
+    (guide,) = re.findall(r"\]\((\.\./[^)#]+)", text)
+    assert (folder / guide).is_file()
 
 
 def test_a_planner_that_imitates_has_the_options_of_imitation() -> None:
