@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
@@ -112,6 +113,10 @@ def test_the_sdist_makes_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr  # without words, build makes the wheel of the sdist
     (source,), (built,) = tmp_path.glob("*.tar.gz"), tmp_path.glob("*.whl")
     assert source.stat().st_size < MOST_BYTES
+    with tarfile.open(source) as archive:
+        folders = {name.split("/")[1] for name in archive.getnames()}
+    assert "examples" in folders
+    assert "tests" not in folders  # they need files that are not there
     with zipfile.ZipFile(built) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/")}
     here = {str(path.relative_to(wheel)) for path in wheel.rglob("*") if path.is_file()}
