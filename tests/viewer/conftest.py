@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import ctypes
 import io
 import itertools
 import json
@@ -13,7 +14,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,8 @@ class Browser:
     def __init__(self, connection: ClientConnection) -> None:
         self._connection = connection
         self._calls = itertools.count(1)
-        self._session: str | None = None
+        self._session: str | None = None  # of the open page
+        self._heard: str | None = None  # of the page whose messages are kept
         self._spoken: list[str] = []
 
     def call(self, method: str, **parameters: Any) -> Any:
@@ -111,7 +113,7 @@ class Browser:
             if answer.get("id") == number:
                 assert "error" not in answer, answer
                 return answer["result"]
-            if answer.get("method") in SPEECH:
+            if answer.get("method") in SPEECH and answer.get("sessionId") == self._heard:
                 self._spoken.append(json.dumps(answer["params"]))
 
     @contextmanager
@@ -122,21 +124,23 @@ class Browser:
         screens are those of phones."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session, self._spoken = session["sessionId"], []
-        for domain in ("Page", "Runtime", "Log"):
-            self.call(f"{domain}.enable")
-        screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1}
-        self.call("Emulation.setDeviceMetricsOverride", **screen, mobile=size[0] < 500)
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.call("Emulation.setEmulatedMedia", features=[scheme])
-        self.call("Page.navigate", url=url)
-        self.ask(DRAWN)
-        yield
+        self._session = self._heard = session["sessionId"]
+        self._spoken = []
+        try:
+            for domain in ("Page", "Runtime", "Log"):
+                self.call(f"{domain}.enable")
+            screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1}
+            self.call("Emulation.setDeviceMetricsOverride", **screen, mobile=size[0] < 500)
+            scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+            self.call("Emulation.setEmulatedMedia", features=[scheme])
+            self.call("Page.navigate", url=url)
+            self.ask(DRAWN)
+            yield
+        finally:
+            self._session = None
+            self.call("Target.closeTarget", targetId=target)
         # Chromium itself writes this line about the screenshot.
-        unexpected = [line for line in self._spoken if "GPU stall due to ReadPixels" not in line]
-        self._session = None
-        self.call("Target.closeTarget", targetId=target)
-        assert not unexpected
+        assert not [line for line in self._spoken if "GPU stall due to ReadPixels" not in line]
 
     def go(self, address: str) -> None:
         """Changes what stands behind the # of the page's address, and waits until it is drawn."""
@@ -167,6 +171,11 @@ class Browser:
             return whole[round(box["top"]) : round(box["bottom"]), round(box["left"]) :]
 
 
+def _end_with_parent() -> None:
+    """Has Linux end this process when the tests end, even if they are killed."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # 1: PR_SET_PDEATHSIG
+
+
 @pytest.fixture(scope="package")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -182,7 +191,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         *("--remote-debugging-port=0", "about:blank"),
     ]
     quiet = subprocess.DEVNULL
-    with subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True) as process:
+    with subprocess.Popen(
+        command, stdout=quiet, stderr=quiet, start_new_session=True, preexec_fn=_end_with_parent
+    ) as process:
         try:
             port = profile / "DevToolsActivePort"  # its port, then the path of its socket
             deadline = time.monotonic() + PATIENCE
@@ -194,4 +205,5 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
             with connect(f"ws://127.0.0.1:{number}{path}", max_size=None, proxy=None) as connection:
                 yield Browser(connection)
         finally:
-            os.killpg(process.pid, signal.SIGKILL)  # with all its children
+            with suppress(ProcessLookupError):  # it has ended at once
+                os.killpg(process.pid, signal.SIGKILL)  # with all its children

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from tsbench import tasks
 from tsbench.core.files import write_new
 from tsbench.leaderboard.page import write_site
+from tsbench.leaderboard.submission import Manifest
 from tsbench.runs.directory import RunDirectory
 from tsbench.viewer import page, report
 from tsbench.viewer.show import Show
@@ -28,6 +30,7 @@ pytestmark = pytest.mark.browser
 WINDOW, PHONE, ON_ITS_SIDE = (1280, 900), (390, 844), (844, 390)
 SCREENS = (WINDOW, PHONE, ON_ITS_SIDE)
 BOARD = Path(__file__).parents[2] / "leaderboards"
+HTML, URL = "<script>alert(1)</script>", f"https://example.org/?{'a=1&b=2' * 20}'\"><b>"
 
 BOXES = """(() => {
   const boxes = (selector) => [...document.querySelectorAll(selector)]
@@ -228,15 +231,27 @@ def test_text_can_be_read_in_both_schemes(
 def test_the_leaderboard_fits_the_screen(
     browser: Browser, tmp_path: Path, screen: tuple[int, int]
 ) -> None:
-    """With the kept entries. On a phone on its side tables may scroll within their frames."""
-    write_site(BOARD, tmp_path, None, lambda line: None)
-    for path in [tmp_path / "index.html", *sorted(tmp_path.rglob("*/*/index.html"))[:3]]:
+    """With the kept entries, and one whose texts are long or HTML. On a phone on its side tables
+    may scroll within their frames."""
+    board, site, long = tmp_path / "board", tmp_path / "site", f"long{'_name' * 12}"
+    task = next((BOARD / "v1").glob("rocket*"))
+    entry = shutil.copytree(task / "twostage", board / "v1" / task.name / long)
+    manifest = Manifest.decode((entry / "manifest.json").read_bytes())
+    described = replace(
+        manifest.described, entry=long, authors=(HTML, long), hardware=HTML * 4, url=URL
+    )
+    (entry / "manifest.json").write_bytes(replace(manifest, described=described).encode())
+    for kept, folder in ((BOARD, site / "kept"), (board, site / "long")):
+        write_site(kept, folder, None, lambda line: None)
+    pages = [*site.glob("*/index.html"), *site.glob("long/*/*/index.html")]
+    assert len(pages) == 3
+    for path in [*pages, *sorted((site / "kept").glob("*/*/index.html"))[:3]]:
         with browser.open(path.as_uri(), screen):
             assert browser.ask("document.documentElement.scrollWidth - innerWidth") <= 0, path
             cut = """[...document.querySelectorAll(".wide")]
               .map((one) => one.scrollWidth - one.clientWidth)"""
             assert screen == ON_ITS_SIDE or max(browser.ask(cut)) <= 0
-            browser.screenshot(f"site_{path.parent.name}_{screen[0]}")
+            browser.screenshot(f"site_{path.parent.name[:20]}_{screen[0]}")
 
 
 def test_the_address_of_a_report_opens_a_moment(browser: Browser, make_run: MakeRun) -> None:
