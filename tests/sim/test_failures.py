@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -220,3 +221,10 @@ def test_a_score_is_not_made_from_what_is_no_number(task: Task[Any]) -> None:
     physics: Physics[Any] = Physics(task, 3, threads=1)
     with pytest.raises(TsbenchError, match="reward of environment 2 is not finite at step 1"):
         play(wrong_reward(task), physics, lambda o: np.zeros((len(o), 12)), 3, 0)
+
+
+def test_what_is_no_number_can_leave_the_process_of_a_pool() -> None:
+    error = NotFiniteError("reward is not finite", {"state": STILL})
+    again = pickle.loads(pickle.dumps(error))
+    assert str(again) == str(error)
+    assert np.array_equal(again.arrays["state"], STILL)

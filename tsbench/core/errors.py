@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np  # takes half of the time in which `tsbench --help` answers
@@ -64,6 +64,10 @@ class NotFiniteError(TsbenchError):
     def __init__(self, message: str, arrays: Mapping[str, np.ndarray]) -> None:
         super().__init__(message)
         self.arrays = arrays
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """So that it can leave the process of a pool."""
+        return type(self), (str(self), self.arrays)
 
 
 class Stopped(KeyboardInterrupt):
