@@ -133,6 +133,32 @@ def test_what_was_tuned_is_held_against_the_tuned_method(make: Callable[..., Res
     }
 
 
+def test_a_budget_is_held_against_the_same_budget_and_has_a_panel_of_its_own(
+    make: Callable[..., Result],
+) -> None:
+    def larger(row: Result) -> Result:
+        words = tuple(word.replace("smoke", "paper") for word in row.words)
+        return replace(row, words=words, budget="paper")
+
+    rows = [make(method, seed, 0.1) for method in (OURS, MONOLITHIC) for seed in (0, 1)]
+    rows += [larger(make(OURS, 0, 0.3)), larger(make(MONOLITHIC, 0, 0.9))]
+    groups = grouped(of(rows).groups())
+    lines = scores.table(groups, {ROCKET: tasks.make(ROCKET)})
+    differences = {line.group.label: line.against and line.against.mean for line in lines}
+    ours, monolithic = f"{OURS}, budget paper", f"{MONOLITHIC}, budget paper"
+    assert differences == {
+        OURS: None,
+        ours: pytest.approx(0.2),
+        MONOLITHIC: pytest.approx(0.0),
+        monolithic: pytest.approx(0.6),
+    }
+    curve = Curve("imitate", *np.ones((3, 2)))
+    kept = replace(of(rows), curves={row.words: (curve,) for row in rows})
+    exhibit = next(learning.exhibits(kept, groups, {ROCKET: tasks.make(ROCKET)}))
+    titles = [panel.get_title(loc="left") for panel in exhibit.figure.axes]
+    assert titles == [f"{ROCKET}, budget paper", f"{ROCKET}, budget smoke"]
+
+
 def test_variants_of_a_method_are_told_apart(make: Callable[..., Result]) -> None:
     few, many = "task.training.imitate.epochs=2", "task.training.imitate.epochs=8"
     (group,) = grouped(of([make(OURS, 0, 0.1, 1.0, few)]).groups())

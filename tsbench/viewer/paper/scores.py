@@ -41,7 +41,7 @@ class Line:
         succeeding: seeds that solve at least `ENOUGH` of them.
         measures: means of the task's leading measures, over the seeds that have them.
         against: `solved_reward` less that of the two-stage method with the same seeds, and
-            with as many trials of tuning if there is such a group.
+            with as many trials of tuning and the same budget if there is such a group.
         p_value: of that, after Holm over the rows of the table that have an interval; None for
             the others.
     """
@@ -73,14 +73,22 @@ def table(groups: Sequence[Group], tasks: dict[str, Task]) -> list[Line]:
 
 def _ours(groups: Sequence[Group], group: Group) -> Group | None:
     """The two-stage method's group that another one is held against: the one with its default
-    settings, or with as many trials of tuning as the other, if there is one. The default group is
-    held against none, and the tuned ones against it."""
+    settings, or with the tuning trials and budget of the other, if there is one. The default group
+    is held against none, and those of other trials or budgets against it."""
     defaults = papers_group(groups, group.task, OURS) or main_group(groups, group.task, OURS)
     if group is defaults:
         return None
-    alike = [one for one in groups if one.first.trials == group.first.trials > 0]
-    tuned = main_group(alike, group.task, OURS)
-    return tuned if tuned and group.method != OURS else defaults
+    if group is defaults:
+        return None
+    if group.method == OURS or defaults is None or _effort(group) == _effort(defaults):
+        return defaults
+    alike = [one for one in groups if _effort(one) == _effort(group)]
+    return main_group(alike, group.task, OURS) or defaults
+
+
+def _effort(group: Group) -> tuple[int, str]:
+    """Trials of tuning, and the budget."""
+    return group.first.trials, group.first.budget
 
 
 def _line(
