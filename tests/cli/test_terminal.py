@@ -186,7 +186,7 @@ def test_words_of_other_commands(
         (["evaluate", "one", "--protocol", "smoke", TASK], "no policy one; without a file there"),
         (["export", "one", TASK, "--method", "x", "out"], "no model one: there is no such file"),
         (["verify", "one", "--threads", "1", "two"], "no entry one"),
-        (["compare", "--json", "x", "one", "--png", "y", "two"], "there is no directory one"),
+        (["compare", "--json", "x", "one", "--png", "y.png", "two"], "there is no directory one"),
         (["evaluate", "--threads", "1", "--", "one", TASK], "no policy one; without a file there"),
     ],
 )
