@@ -12,7 +12,6 @@ in stance; whether the plan passes its audit.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -22,7 +21,6 @@ from rich.console import Console
 from rich.table import Table
 
 from tsbench import tasks
-from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.motion import Plan
 from tsbench.core.task import Plannable, plannable, roadmap_space
 from tsbench.planning.roadmap import cycled, find_route
@@ -60,19 +58,6 @@ def layered() -> list[str]:
     return [name for name, task in planned.items() if task.abstraction().lattice() is not None]
 
 
-def chosen(names: Sequence[str]) -> list[str]:
-    """The tasks of these names; without any all that there are figures of.
-
-    Raises:
-        TsbenchError: there are no figures of such a task.
-    """
-    known = layered()
-    for name in names:
-        if name not in known:
-            raise unknown("task with a gait", name, known)
-    return [*names] or known
-
-
 def show(names: Sequence[str]) -> None:
     for name in names:
         task = plannable(tasks.make(name))
@@ -101,16 +86,14 @@ def show(names: Sequence[str]) -> None:
         Console(width=100).print(table)
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("tasks", nargs="*", metavar="TASK", help="(all that have a gait)")
-    try:
-        show(chosen(parser.parse_args().tasks))
-    except TsbenchError as error:
-        sys.stderr.write(f"footsteps: {error}\n")
-        return 2
-    return 0
+    options, known = parser.parse_args(), layered()
+    if wrong := [name for name in options.tasks if name not in known]:
+        parser.error(f"{wrong[0]} is no task with a gait; there are {', '.join(known)}")
+    show(options.tasks or known)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -14,7 +14,6 @@ clearance of the plan from what is to be avoided; whether the plan passes its au
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,7 +24,6 @@ from rich.console import Console
 from rich.table import Table
 
 from tsbench import tasks
-from tsbench.core.errors import TsbenchError, unknown
 from tsbench.core.roadmap import RoadmapSpace
 from tsbench.core.task import Plannable, plannable, roadmap_space
 from tsbench.planning.roadmap import find_route, resampled
@@ -93,17 +91,8 @@ def clearance(task: Any, qpos: np.ndarray) -> float:
     return float(state.clearance.min(initial=np.inf))
 
 
-def chosen(names: Sequence[str]) -> list[str]:
-    """The tasks of these names; without any all rockets.
-
-    Raises:
-        TsbenchError: there is no such rocket.
-    """
-    known = [name for name in tasks.names() if isinstance(tasks.make(name), Rocket)]
-    for name in names:
-        if name not in known:
-            raise unknown("rocket", name, known)
-    return [*names] or known
+def rockets() -> list[str]:
+    return [name for name in tasks.names() if isinstance(tasks.make(name), Rocket)]
 
 
 def show(names: Sequence[str]) -> None:
@@ -127,16 +116,14 @@ def show(names: Sequence[str]) -> None:
         console.print(table)
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("tasks", nargs="*", metavar="TASK", help="(all rockets)")
-    try:
-        show(chosen(parser.parse_args().tasks))
-    except TsbenchError as error:
-        sys.stderr.write(f"planners: {error}\n")
-        return 2
-    return 0
+    options, known = parser.parse_args(), rockets()
+    if wrong := [name for name in options.tasks if name not in known]:
+        parser.error(f"{wrong[0]} is no rocket; there are {', '.join(known)}")
+    show(options.tasks or known)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -164,7 +164,7 @@ def test_both_updates_are_the_same(changes: dict[str, Any]) -> None:
             np.testing.assert_allclose(after[name], value, atol=1e-3 * moved, err_msg=name)
 
 
-def test_the_value_s_gradient_passes_within_the_clip() -> None:
+def test_the_value_s_gradient_passes_within_the_clip(monkeypatch: pytest.MonkeyPatch) -> None:
     """There the clipped error is the error but for rounding, which must not decide."""
     settings = replace(SMALL, clip_value=True, update="numpy")
     subject = Subject(settings)
@@ -177,9 +177,8 @@ def test_the_value_s_gradient_passes_within_the_clip() -> None:
     )
     change, far = np.float32(0.9 * settings.clip) * share, np.float32(0.4) * np.sign(error)
     passed: list[np.ndarray] = []
-    update._value = SimpleNamespace(  # type: ignore[assignment]
-        forward=lambda _: now, backward=passed.append, step=lambda _: None
-    )
+    value = SimpleNamespace(forward=lambda _: now, backward=passed.append, step=lambda _: None)
+    monkeypatch.setattr(update, "_value", value)
     update._update_value(now, now - error, now - change)
     np.testing.assert_allclose(passed[0], 2.0 * error / len(error), rtol=1e-3, atol=1e-8)
     # Beyond the range it passes only where the clipped error is the smaller one.

@@ -25,7 +25,7 @@ from tsbench.runs import config, results
 from tsbench.runs.directory import Record, RunDirectory, Stage
 from tsbench.runs.execute import prepare
 from tsbench.runs.provenance import write_provenance
-from tsbench.runs.results import Curve, Result, Results
+from tsbench.runs.results import Curve, Result, Results, read
 from tsbench.sim.kinematic import naive_plan, plan_along
 from tsbench.viewer.paper import ladder, learning, maps, page, plans, scores
 from tsbench.viewer.paper.exhibit import (
@@ -419,3 +419,29 @@ def test_the_commands_keep_a_run_and_draw_it_with_a_strip(
     assert row.trials == 6
     for name in ("strip_laikago_trot.png", "plans_laikago_trot.svg", "table.md", "index.html"):
         assert (tmp_path / "out" / name).exists(), name
+
+
+def test_the_table_of_the_documentation_is_that_of_the_kept_results() -> None:
+    """All its columns but the range over the seeds."""
+    lines = (ROOT / "docs" / "results.md").read_text(encoding="utf-8").splitlines()
+    told: dict[tuple[str, str], tuple[str, ...]] = {}
+    task = ""
+    for line in lines[lines.index("## What came out") : lines.index("## The paper's results")]:
+        name, *rest = (cell.strip() for cell in line.strip("|").split("|"))
+        if name.startswith("**") and rest:
+            task = name.split("**")[1]
+        elif name.startswith("`") and rest:
+            label = name.replace("`", "").replace("shortcuts", "shortcut=true")
+            told[task, label.replace("layered", "roadmap=layered")] = (*rest[:2], *rest[3:])
+    results = read([ROOT / "results" / "paper"])
+    groups = grouped([rows for rows in results.groups() if rows[0].standard])
+    found = {}
+    for row in scores.table(groups, {name: tasks.make(name) for name in tasks.names()}):
+        _, label, seeds, solved, _, success, succeeding, less, _, steps, _, _ = scores.cells(row)
+        number, letter = steps[:-1], steps[-1]
+        found[row.group.task, label] = (
+            seeds.partition(",")[0], solved, success, succeeding.partition(" ")[0], less,
+            f"{number} {letter}",
+        )  # fmt: skip
+    assert len(told) == 20
+    assert told == {name: found[name] for name in told}

@@ -1,5 +1,5 @@
-"""Bounded reads of files that anybody may have made, atomic writes, and writes that refuse to
-replace an existing file."""
+"""Bounded reads of files that anybody may have made, atomic writes, writes that refuse to replace
+an existing file, and locks."""
 
 from __future__ import annotations
 
