@@ -174,5 +174,5 @@ def test_an_entry_with_the_score_of_another_policy_fails(
     assert re.search(rf"FAILED: not re-scored: seed5 broke off: {said}\n", told), told
     shutil.move(run, "forged")
     shutil.rmtree("board")
-    assert cli.main(["submit", "forged", *WHO, "--check", "--threads", "1"]) == 1
+    assert cli.main(["submit", "forged", *WHO, *TOLD, "--check", "--threads", "1"]) == 1
     assert re.search(rf"FAILED: not re-scored: seed5 broke off: {said}\n", capsys.readouterr().out)
