@@ -321,6 +321,12 @@ def test_a_log_of_something_else_does_not_replay(score: Score, log: ActionLog) -
     assert not replay(TASK, score, replace(log, task_version=2))
 
 
+def test_a_log_of_the_nominal_episode_alone_is_replayed(score: Score, log: ActionLog) -> None:
+    origin = replace(score.origin, protocol=replace(PROTOCOL, logged=0))
+    alone = replace(log, actions=log.actions[:, :1], rewards=log.rewards[:, :1])
+    assert replay(TASK, replace(score, origin=origin), alone)
+
+
 def test_a_log_on_another_kind_of_machine_that_does_not_replay(
     score: Score, log: ActionLog
 ) -> None:

@@ -764,14 +764,14 @@ def test_a_run_of_any_method_becomes_an_entry(capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("entry", KEPT, ids=IDS)
 def test_every_flipped_byte_is_noticed(entry: Path, tmp_path: Path) -> None:
-    """200 random bytes, over all files of an entry. The message names the file."""
+    """40 random bytes, over all files of an entry. The message names the file."""
     rng = np.random.default_rng(0)
     copy = tmp_path / entry.parent.name / entry.name
     shutil.copytree(entry, copy)
     files = sorted(path for path in copy.rglob("*") if path.is_file())
     submission.read_entry(copy)
     noticed = 0
-    for number in range(200):
+    for number in range(40):
         file = files[number % len(files)]
         content = file.read_bytes()
         changed = bytearray(content)
@@ -781,11 +781,13 @@ def test_every_flipped_byte_is_noticed(entry: Path, tmp_path: Path) -> None:
             submission.read_entry(copy)
         noticed += 1
         file.write_bytes(content)
-    assert noticed == 200
+    assert noticed == 40
 
 
-@pytest.mark.parametrize("entry", KEPT, ids=IDS)
-def test_the_entries_of_the_repository(entry: Path) -> None:
+@pytest.mark.parametrize("entry", [entry for entry in KEPT if entry.name == "twostage"], ids=str)
+def test_an_entry_of_each_task_is_verified(entry: Path) -> None:
+    """One training of every other entry is replayed in tests/evaluation/test_entries.py, and
+    `tsbench verify --all` verifies all of them."""
     verdict = verify.verify(entry, verify.Asked(rescore=False, threads=1))
     assert verdict.passed, verdict.reasons
 

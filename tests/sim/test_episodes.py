@@ -140,6 +140,18 @@ def test_many_side_by_side() -> None:
     assert together.states[:, 1].tolist() == [0, -1, -2] + [-3] * 8
 
 
+def test_kept_actions_are_played_instead_of_a_policy() -> None:
+    """Each episode takes its own, whichever others have ended before."""
+    starts = [0.0, 0.0, 6.0, 0.0]
+    once = walk(starts, [1.0, -1.0, 1.0, 0.25])
+    mdp = Walk(starts, [1.0, -1.0, 1.0, 0.25])
+    again = play(mdp, mdp, once.actions, 4)
+    assert len(set(once.lengths.tolist())) > 2
+    np.testing.assert_array_equal(again.actions, once.actions)
+    np.testing.assert_array_equal(again.rewards, once.rewards)
+    np.testing.assert_array_equal(again.final.x, once.final.x)
+
+
 def test_record_after_the_last_end() -> None:
     """Ended episodes are not stepped, and play stops when all have ended. The record still has
     full length."""

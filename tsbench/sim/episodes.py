@@ -77,7 +77,7 @@ class Episodes(Generic[S]):
 def play(
     mdp: MDP[S],
     dynamics: Dynamics[S],
-    policy: PolicyFunction,
+    policy: PolicyFunction | Array,
     count: int,
     seed: int = 0,
     record: Callable[[S], np.ndarray] | None = None,
@@ -92,7 +92,8 @@ def play(
     Args:
         mdp: what is played.
         dynamics: what steps it.
-        policy: sees only the episodes that have not ended.
+        policy: sees only the episodes that have not ended. Or the actions to play, shape
+            (steps, count, action_size), of which those after an episode's end are not used.
         count: of episodes.
         seed: of their starts.
         record: what to keep of all states.
@@ -119,7 +120,10 @@ def play(
     pending = np.zeros((delay, count, mdp.action_size))
     recorded = [record(state)] if record else []
     for step in range(longest):
-        action = np.asarray(policy(mdp.observation(state)))
+        if callable(policy):
+            action = np.asarray(policy(mdp.observation(state)))
+        else:
+            action = policy[step, rows]
         if delay:
             due = pending[step % delay, rows]
             pending[step % delay, rows] = action
