@@ -43,7 +43,9 @@ def test_most_trainings_fly_the_rocket_to_its_goal(tmp_path: Path) -> None:
         chosen = replace(config.compose(words), directory=str(tmp_path / str(seed)))
         score = execute.execute(chosen, words, Console(quiet=True))
         near.append(score.perturbed.goal_distance <= 0.3 * DISTANCE)
-    assert sum(near) >= 2
+        if sum(near) == 2:
+            return  # the third one decides nothing
+    assert sum(near) >= 2, near
 
 
 def test_the_switch_perturbs_every_network(

@@ -22,43 +22,16 @@ WORDS = [
     "task.constants.distance=6.0",
     "seed=0,1",
 ]
-PLUGIN = """
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from multiprocessing import get_context
-
-from hydra._internal.core_plugins.basic_launcher import BasicLauncher
-from hydra.core.config_store import ConfigStore
-
-
-@dataclass
-class Config:
-    _target_: str = "hydra_plugins.elsewhere.Elsewhere"
-
-
-class Elsewhere(BasicLauncher):
-    def launch(self, job_overrides, initial_job_idx):
-        with ProcessPoolExecutor(1, get_context("fork")) as pool:
-            return pool.submit(
-                BasicLauncher.launch, self, job_overrides, initial_job_idx
-            ).result()
-
-
-ConfigStore.instance().store(group="hydra/launcher", name="elsewhere", node=Config)
-"""
-
-
 RAY = "TSBENCH_TEST_RAY"  # set to test with Ray, in an environment that has hydra-ray-launcher
 POLICY = "policy.safetensors"
 
 
 def start(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """`tsbench run` in a folder, with the packages in its `plugins`."""
-    path = os.pathsep.join([str(folder / "plugins"), *sys.path])
+    """`tsbench run` in a folder."""
     return subprocess.run(
         [sys.executable, "-m", "tsbench", "run", *words],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": path},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
     )
@@ -76,7 +49,6 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("launcher", "words"),
     [
-        ("elsewhere", ()),
         ("joblib", ("hydra.launcher.n_jobs=2",)),
         ("ray", ("+hydra.launcher.ray.init.num_cpus=2",)),
     ],
@@ -90,9 +62,6 @@ def test_jobs_in_other_processes(
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs tsbench[joblib]")
     if launcher == "ray" and not os.environ.get(RAY):
         pytest.skip(f"{RAY} is not set: Ray takes 360 MB and older packages than constraints.txt")
-    plugins = tmp_path / "plugins"
-    (plugins / "hydra_plugins").mkdir(parents=True)
-    (plugins / "hydra_plugins" / "elsewhere.py").write_text(PLUGIN)
     jobs = [[*WORDS[:-1], f"seed={seed}"] for seed in (0, 1)]
     places = [str(directory(config.compose(job), job)) for job in jobs]
     (tmp_path / places[0]).mkdir(parents=True)

@@ -289,7 +289,7 @@ def test_a_broken_plugin_breaks_nothing_else(file: str, toy: Toy, tmp_path: Path
     assert done.returncode == 2
     assert done.stderr.startswith("tsbench: unknown task 'toy_flight'; ")
     assert done.stderr.endswith(f"; {line}\n")
-    assert call(tmp_path, "run", f"task={SOME}", "--cfg", "job").returncode == 0
+    assert call(tmp_path, "describe", SOME).returncode == 0
 
 
 def test_a_broken_method_is_told_when_it_is_used(toy: Toy, tmp_path: Path) -> None:
@@ -302,7 +302,7 @@ def test_a_broken_method_is_told_when_it_is_used(toy: Toy, tmp_path: Path) -> No
     assert done.stderr == (
         "tsbench: the plug-in toy-tasks 1.0 cannot be used: ZeroDivisionError: division by zero\n"
     )
-    done = call(tmp_path, "run", f"task={SOME}", "--cfg", "job")
+    done = call(tmp_path, "describe", SOME)
     assert done.returncode == 0, done.stderr
 
 
