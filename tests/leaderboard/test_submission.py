@@ -784,7 +784,11 @@ def test_every_flipped_byte_is_noticed(entry: Path, tmp_path: Path) -> None:
     assert noticed == 40
 
 
-@pytest.mark.parametrize("entry", [entry for entry in KEPT if entry.name == "twostage"], ids=str)
+@pytest.mark.parametrize(
+    "entry",
+    [entry for entry in KEPT if entry.name == "twostage"],
+    ids=lambda entry: entry.parent.name,
+)
 def test_an_entry_of_each_task_is_verified(entry: Path) -> None:
     """One training of every other entry is replayed in tests/evaluation/test_entries.py, and
     `tsbench verify --all` verifies all of them."""

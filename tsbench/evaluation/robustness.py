@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.optimize import isotonic_regression
+import scipy  # loads `scipy.optimize` when it is used
 
 from tsbench.core.state import Course, Start
 from tsbench.core.task import Task
@@ -257,7 +257,9 @@ def impulse_50(
         the largest pushes are withstood.
     """
     x = np.concatenate([[0.0], impulses])
-    y = isotonic_regression(np.concatenate([[float(unpushed)], shares]), increasing=False).x
+    y = scipy.optimize.isotonic_regression(
+        np.concatenate([[float(unpushed)], shares]), increasing=False
+    ).x
     below = np.flatnonzero(y <= 0.5)
     if not len(below):
         return float(x[-1]), True

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import bootstrap, mannwhitneyu, permutation_test
+import scipy  # loads `scipy.stats` when it is used
 
 RANKED_SEEDS = 10
 PROVISIONAL_SEEDS = 3
@@ -157,7 +157,7 @@ def paired_difference(
     shares = np.concatenate([sample / (len(sample) * len(pairs)) for sample in pairs])
     p_value = 1.0  # of a single pair, whose mean is as far from zero the other way round
     if len(shares) > 1:
-        p_value = permutation_test(
+        p_value = scipy.stats.permutation_test(
             (shares,),
             lambda signed, axis=-1: signed.sum(axis=axis),
             permutation_type="samples",
@@ -215,7 +215,7 @@ def compared(
 
 def _interval(samples: Sequence[np.ndarray], statistic: Any, seed: int) -> tuple[float, float]:
     """Bootstrap interval of a statistic of one sample per task, each resampled separately."""
-    found = bootstrap(
+    found = scipy.stats.bootstrap(
         tuple(samples),
         statistic,
         n_resamples=RESAMPLES,
@@ -250,7 +250,9 @@ def probability_of_improvement(first: Sequence[np.ndarray], second: Sequence[np.
         ValueError: a task has no runs, or the methods have different numbers of tasks.
     """
     pairs = zip(_checked(first), _checked(second), strict=True)
-    return float(np.mean([mannwhitneyu(a, b).statistic / (len(a) * len(b)) for a, b in pairs]))
+    return float(
+        np.mean([scipy.stats.mannwhitneyu(a, b).statistic / (len(a) * len(b)) for a, b in pairs])
+    )
 
 
 def _checked(samples: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
