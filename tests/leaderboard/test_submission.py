@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -188,7 +188,7 @@ def test_a_kept_verdict_is_replaced_by_a_higher_state_or_a_failure(finished: Pat
     # On other files it says nothing.
     other = replace(first, digest="0" * 64)
     (board / "verdicts/quick/rocket_navigation/mine.json").write_text(
-        json.dumps(verify.plain(replace(other, state="re-trained")))
+        json.dumps(asdict(replace(other, state="re-trained")))
     )
     assert verify.record(board, ENTRY, first) is not None
 
@@ -238,9 +238,9 @@ def test_an_entry_keeps_the_learning_curves(
     ("change", "line"),
     [
         ({"entropy": 1.0}, "holds more than the learning curves"),
-        ({"episode_return": 1e300}, "a row lacks its stage, steps or return"),
-        ({"steps": "many"}, "a row lacks its stage, steps or return"),
-        ({"stage": "x" * 65}, "a row lacks its stage, steps or return"),
+        ({"episode_return": 1e300}, "a row lacks its stage, steps, seconds or return"),
+        ({"steps": "many"}, "a row lacks its stage, steps, seconds or return"),
+        ({"stage": "x" * 65}, "a row lacks its stage, steps, seconds or return"),
     ],
 )
 def test_an_entry_keeps_nothing_but_curves(

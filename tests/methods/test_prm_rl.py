@@ -113,7 +113,7 @@ def test_the_next_corner() -> None:
     task = tasks.make("rocket_navigation")
     corners = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]])
     points = np.concatenate([[[x, 0.0] for x in range(11)], [[10.0, z] for z in range(1, 11)]])
-    route = Route(Graph(corners, np.zeros((0, 2), np.int64), np.zeros(0), 0), corners, points, 80.0)
+    route = Route(Graph(corners, np.zeros((0, 2), np.int64), np.zeros(0), 0), corners, points)
     target = next_corner(space_of(task), route)
     state = plannable(task).abstraction().start(5)
     positions = [[0.0, 2.0], [8.4, -1.0], [9.6, 0.2], [12.0, 5.0], [10.0, 10.0]]

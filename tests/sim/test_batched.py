@@ -23,10 +23,6 @@ from tsbench.testing.episodes import compare, plannable_tasks, play_batched, sam
 ROWS = 3
 
 
-def row(start: Start, index: int) -> Start:
-    return Start(*(getattr(start, field.name)[index : index + 1] for field in fields(Start)))
-
-
 def test_equal_through_a_collision() -> None:
     """Rockets that fall onto an obstacle and roll off it."""
     task = tasks.make("rocket_obstacles")
@@ -50,7 +46,7 @@ def test_rows_do_not_know_each_other(name: str) -> None:
     threaded, _ = play_batched(task, starts, actions, threads=2)
     assert all(same(*pair) for pair in zip(states, threaded, strict=True))
 
-    alone, alone_rewards = play_batched(task, row(starts, 4), actions[:, 4:5])
+    alone, alone_rewards = play_batched(task, starts.rows(slice(4, 5)), actions[:, 4:5])
     assert all(same(a.rows(slice(4, 5)), b) for a, b in zip(states, alone, strict=True))
     np.testing.assert_array_equal(rewards[:, 4:5], alone_rewards)
 

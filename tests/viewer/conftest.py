@@ -80,7 +80,9 @@ def make_run(
         naive_plan(name).save(path / "plan.npz")
         naive_reference(name).save(path / "reference.npz")
         write_json(path / "score.json", invented_record(name).as_dict())
-        rows = [{"stage": "plan", "steps": 100 * i, "episode_return": i} for i in range(5)]
+        rows = [
+            {"stage": "plan", "steps": 100 * i, "seconds": i, "episode_return": i} for i in range(5)
+        ]
         (path / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)))
         return path
 

@@ -15,12 +15,12 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from tsbench.bench.turns import FULL, QUICK, Effort, Range
+from tsbench.core import plugins
 from tsbench.core.errors import unknown
 
 # Packages whose version can change a figure.
@@ -37,12 +37,8 @@ def machine() -> dict[str, Any]:
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
     }
-    for name in (*PACKAGES, *EXTRAS):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue  # an extra that nobody installed
-    return found
+    versions = {name: plugins.version_of(name) for name in (*PACKAGES, *EXTRAS)}
+    return found | {name: version for name, version in versions.items() if version}
 
 
 def _processor() -> str:

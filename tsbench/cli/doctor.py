@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import requires
 
 from tsbench import gl, methods, tasks
 from tsbench.core import plugins
@@ -47,10 +47,7 @@ def _system() -> str:
 
 
 def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return MISSING
+    return plugins.version_of(name) or MISSING
 
 
 def _graphics() -> str:

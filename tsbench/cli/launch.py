@@ -143,7 +143,7 @@ def _resume(place: Path) -> Path:
         The run directory.
     """
     found = RunDirectory(place)
-    if not found.finished or found.report_file.exists():
+    if not found.finished or (found.view_file.exists() and found.report_file.exists()):
         execute.resume(place)
     return place
 

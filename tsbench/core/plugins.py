@@ -137,10 +137,16 @@ def plugins(group: str) -> tuple[Plugin, ...]:
 @cache
 def own() -> Provider:
     """tsbench itself."""
+    # A checkout on the path may never have been installed.
+    return Provider(OWN, OWN, version_of(OWN) or "0+unknown")
+
+
+def version_of(package: str) -> str | None:
+    """The version of an installed package, or None without it."""
     try:
-        return Provider(OWN, OWN, version(OWN))
-    except PackageNotFoundError:  # a checkout on the path that was never installed
-        return Provider(OWN, OWN, "0+unknown")
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def providers() -> tuple[Provider, ...]:

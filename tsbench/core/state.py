@@ -74,11 +74,11 @@ class Course(Batch):
 
 
 @dataclass(frozen=True)
-class Start:
-    """The initial states of episodes.
+class Start(Batch):
+    """The states in which episodes begin or go on.
 
     Attributes:
-        time: seconds, shape (n,). Zero, except in training that starts along a reference motion.
+        time: seconds since the start of the episode, shape (n,).
         qpos: generalised positions, shape (n, nq).
         qvel: generalised velocities, shape (n, nv).
         memory: the memory of `Plant.control`, shape (n, m).
@@ -88,16 +88,6 @@ class Start:
     qpos: np.ndarray
     qvel: np.ndarray
     memory: np.ndarray
-
-    def rows(self, rows: np.ndarray | slice) -> Start:
-        """Some of the starts."""
-        return Start(self.time[rows], self.qpos[rows], self.qvel[rows], self.memory[rows])
-
-    @classmethod
-    def joined(cls, starts: Sequence[Start]) -> Start:
-        """All of them, one after the other."""
-        fields = [field.name for field in dataclasses.fields(cls)]
-        return cls(*(np.concatenate([getattr(start, f) for start in starts]) for f in fields))
 
 
 @dataclass(frozen=True)

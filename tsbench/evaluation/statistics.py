@@ -100,7 +100,7 @@ def _iqm(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
     return middle / inside.sum(-1)
 
 
-def iqm_interval(samples: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float] | None:
+def iqm_interval(samples: Sequence[np.ndarray]) -> tuple[float, float] | None:
     """95 % percentile bootstrap interval of the interquartile mean, stratified by task: the runs of
     each task are resampled separately. None if a task has fewer than `RANKED_SEEDS` runs.
 
@@ -109,7 +109,7 @@ def iqm_interval(samples: Sequence[np.ndarray], seed: int = 0) -> tuple[float, f
     """
     if standing(samples) != "ranked":
         return None
-    return _interval(samples, _iqm, seed)
+    return _interval(samples, _iqm)
 
 
 @dataclass(frozen=True)
@@ -130,14 +130,12 @@ class Difference:
 def paired_difference(
     first: Mapping[str, Mapping[int, float]],
     second: Mapping[str, Mapping[int, float]],
-    seed: int = 0,
 ) -> Difference:
     """The difference of two methods' scores, over pairs of the same task and training seed.
 
     Args:
         first: scores of the first method by task and training seed.
         second: scores of the second method by task and training seed.
-        seed: seed of the resampling.
 
     Raises:
         ValueError: a mapping is empty, or the methods have different tasks or seeds.
@@ -163,11 +161,11 @@ def paired_difference(
             permutation_type="samples",
             vectorized=True,
             n_resamples=RESAMPLES,
-            rng=np.random.default_rng(seed),
+            rng=np.random.default_rng(0),
         ).pvalue
     return Difference(
         mean=float(_mean(*pairs)),
-        interval=_interval(pairs, _mean, seed) if ranked else None,
+        interval=_interval(pairs, _mean) if ranked else None,
         p_value=float(p_value),
     )
 
@@ -191,7 +189,7 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 
 
 def compared(
-    method: str, table: Mapping[str, Mapping[str, Mapping[int, float]]], seed: int = 0
+    method: str, table: Mapping[str, Mapping[str, Mapping[int, float]]]
 ) -> dict[str, Difference]:
     """The difference of a method to every other method of a table, with p-values adjusted for the
     number of comparisons (`holm`).
@@ -199,13 +197,12 @@ def compared(
     Args:
         method: name of the method.
         table: scores by method, task and training seed.
-        seed: seed of the resampling.
 
     Raises:
         ValueError: see `paired_difference`.
     """
     found = {
-        name: paired_difference(table[method], scores, seed)
+        name: paired_difference(table[method], scores)
         for name, scores in table.items()
         if name != method
     }
@@ -213,7 +210,7 @@ def compared(
     return {name: replace(difference, p_value=adjusted[name]) for name, difference in found.items()}
 
 
-def _interval(samples: Sequence[np.ndarray], statistic: Any, seed: int) -> tuple[float, float]:
+def _interval(samples: Sequence[np.ndarray], statistic: Any) -> tuple[float, float]:
     """Bootstrap interval of a statistic of one sample per task, each resampled separately."""
     found = scipy.stats.bootstrap(
         tuple(samples),
@@ -222,7 +219,7 @@ def _interval(samples: Sequence[np.ndarray], statistic: Any, seed: int) -> tuple
         confidence_level=LEVEL,
         method="percentile",
         vectorized=True,
-        rng=np.random.default_rng(seed),
+        rng=np.random.default_rng(0),
     ).confidence_interval
     return float(found.low), float(found.high)
 

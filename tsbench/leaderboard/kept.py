@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 BOARD = Path("leaderboards")  # in a checkout
@@ -20,15 +19,15 @@ def entries() -> dict[str, Path]:
         if (board := folder / PROTOCOL).is_dir():
             return {
                 f"{task.name}/{entry.name}": entry
-                for task in _folders(board)
-                for entry in _folders(task)
+                for task in folders(board)
+                for entry in folders(task)
             }
     return {}
 
 
 def trainings(entry: Path) -> list[Path]:
     """The directories of an entry's trainings, by seed; none for another directory."""
-    found = [one for one in _folders(entry) if _SEED.fullmatch(one.name)] if entry.is_dir() else []
+    found = [one for one in folders(entry) if _SEED.fullmatch(one.name)]
     return sorted(found, key=lambda one: int(one.name.removeprefix("seed")))
 
 
@@ -44,5 +43,8 @@ def find(name: str) -> Path | None:
     return next((one for one in trainings(found[match[1]]) if one.name == match[2]), None)
 
 
-def _folders(path: Path) -> Iterator[Path]:
-    yield from sorted(one for one in path.iterdir() if one.is_dir() and one.name[0] != ".")
+def folders(path: Path) -> list[Path]:
+    """The folders in a folder of a board, sorted; none where it is no folder."""
+    if not path.is_dir():
+        return []
+    return sorted(one for one in path.iterdir() if one.is_dir() and not one.name.startswith("."))

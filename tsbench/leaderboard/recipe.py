@@ -56,7 +56,9 @@ def lacking(run: RunDirectory) -> tuple[str, ...]:
         if key != "seed" and not _other_budget(key, kept.budget)
     }
     return tuple(
-        f"{key}={_word(value)}" for key, value in wanted.items() if made.get(key, ...) != value
+        f"{key}={config.word(value)}"
+        for key, value in wanted.items()
+        if made.get(key, ...) != value
     )
 
 
@@ -79,12 +81,3 @@ def _other_budget(key: str, budget: str) -> bool:
     return key.startswith("task.gpu.") or (
         key.startswith("task.budgets.") and not key.startswith(f"task.budgets.{budget}.")
     )
-
-
-def _word(value: Any) -> str:
-    """A value in Hydra's grammar."""
-    if isinstance(value, (list, tuple)):
-        return f"[{','.join(map(_word, value))}]"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return str(value)

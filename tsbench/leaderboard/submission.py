@@ -885,8 +885,7 @@ def _without_policy(run: RunDirectory) -> str:
 def _record(part: _Part, task: Task[Any], made: Score) -> Record:
     told = part.told
     assert told is not None
-    model = task.spec().compile()
-    substeps = told.steps * round(task.timestep / model.opt.timestep)
+    substeps = told.steps * task.substeps
     stage = Stage("train", told.steps, told.steps, substeps, seconds=told.seconds)
     return Record(
         task=task.name,

@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,6 +36,7 @@ from tsbench.evaluation.protocol import PROTOCOLS
 from tsbench.evaluation.replay import compare, incomparable, replay
 from tsbench.evaluation.score import Score
 from tsbench.leaderboard import recipe
+from tsbench.leaderboard.kept import folders
 from tsbench.leaderboard.submission import Claim, Entry, Kept, read_entry, read_manifest
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.schema import RunConfig
@@ -385,7 +385,7 @@ def record(board: Path, entry: Path, verdict: Verdict) -> Path | None:
     path = place(board, entry)
     with os_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, (json.dumps(plain(verdict), indent=1) + "\n").encode())
+        write_whole(path, (json.dumps(asdict(verdict), indent=1) + "\n").encode())
     return path
 
 
@@ -393,11 +393,6 @@ def _replaces(verdict: Verdict, before: Verdict) -> bool:
     if RETRACTED in (verdict.state, before.state):
         return verdict.state == RETRACTED
     return not verdict.passed or STATES.index(verdict.state) > STATES.index(before.state)
-
-
-def plain(verdict: Verdict) -> dict[str, Any]:
-    """The verdict as JSON holds it."""
-    return asdict(verdict)
 
 
 def retracted(path: Path, reason: str) -> Verdict:
@@ -424,15 +419,9 @@ def entries(board: Path) -> list[Path]:
     """The directories of all entries of a board, sorted: those of PROTOCOL/TASK/ENTRY."""
     found = []
     for protocol in PROTOCOLS:
-        for task in sorted(_folders(board / protocol)):
-            found += sorted(_folders(task))
+        for task in folders(board / protocol):
+            found += folders(task)
     return found
-
-
-def _folders(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return []
-    return [one for one in path.iterdir() if one.is_dir() and not one.name.startswith(".")]
 
 
 # Pull requests

@@ -257,8 +257,7 @@ def drivable_route(
     corners = graph.points[way]
     proved = np.array([edge for edge, held in kept.items() if held], int)
     graph = Graph(graph.points, graph.edges[proved], graph.costs[proved], len(kept))
-    steps = float(space.steps(corners[:-1], corners[1:]).sum())
-    return Route(graph, corners, resampled(space, corners), steps)
+    return Route(graph, corners, resampled(space, corners))
 
 
 def next_corner(space: DrivableSpace[S], route: Route) -> Callable[[S], np.ndarray]:

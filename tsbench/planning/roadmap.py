@@ -71,13 +71,11 @@ class Route:
         graph: the roadmap that it was found in.
         corners: points between which it is straight, shape (k, d).
         points: where it is after each plan step, shape (T + 1, d).
-        steps: plan steps that it takes, not rounded.
     """
 
     graph: Graph
     corners: np.ndarray
     points: np.ndarray
-    steps: float
 
     def drawn(self, space: RoadmapSpace[Any], plan: Plan) -> Roadmap:
         """The roadmap and the way as they are drawn beside the plan that follows the way."""
@@ -136,8 +134,7 @@ def find_route(
     corners = graph.points[way]
     if shortcut:
         corners = straightened(space, corners)
-    steps = float(space.steps(corners[:-1], corners[1:]).sum())
-    return Route(graph, corners, resampled(space, corners), steps)
+    return Route(graph, corners, resampled(space, corners))
 
 
 def sampled(space: RoadmapSpace[Any], samples: int, seed: int) -> np.ndarray:

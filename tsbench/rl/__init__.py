@@ -1,1 +1,1 @@
-"""Reinforcement learning by rsl-rl. Of the library, only this package imports torch."""
+"""Reinforcement learning by rsl-rl, which only this room and `testing` import."""

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib import import_module
+from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_module
@@ -196,3 +197,12 @@ def one_line_errors() -> Iterator[None]:
 def _flat(error: Exception) -> str:
     """An error's message on one line, without Hydra's list of searched places."""
     return " ".join(str(error).split("Config search path")[0].split())
+
+
+def word(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    if isinstance(value, (list, tuple)):
+        return f"[{','.join(map(word, value))}]"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return str(value)

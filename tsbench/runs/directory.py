@@ -187,7 +187,6 @@ class RunDirectory:
     versions_file = _File("versions.json")
     metrics_file = _File(METRICS)
     log_file = _File(LOG)
-    events_file = _File(EVENTS)
     checkpoints = _File(CHECKPOINTS)
     dump_file = _File("not-finite.npz")
     failure_file = _File("failure.txt")  # the line that a failed plan has ended the run with
@@ -376,6 +375,31 @@ def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
         yield row
 
 
+def curve_points(path: Path) -> Iterator[tuple[str, dict[str, float]]]:
+    """The learning curves in a run's `metrics.jsonl`: of each row with a return its stage, and its
+    steps, seconds and returns by their names.
+
+    Raises:
+        TsbenchError: the file is missing or damaged.
+    """
+    stages = set()
+    for row in read_metrics(path):
+        returns = {name: row[name] for name in RETURNS if name in row}
+        if not returns:
+            continue
+        stage = row.get("stage")
+        point: dict[str, Any] = {"steps": row.get("steps"), "seconds": row.get("seconds")} | returns
+        numbers = all(type(one) in (int, float) and abs(one) < LARGEST for one in point.values())
+        if not (isinstance(stage, str) and len(stage) <= 64 and numbers):
+            raise TsbenchError(
+                f"damaged metrics {path}: a row lacks its stage, steps, seconds or return"
+            )
+        stages.add(stage)
+        if len(stages) > MOST_STAGES:
+            raise TsbenchError(f"damaged metrics {path}: more than {MOST_STAGES} stages")
+        yield stage, point
+
+
 def thin_metrics(path: Path) -> bytes:
     """A run's `metrics.jsonl` with the learning curves alone: of each stage at most `POINTS` rows,
     the first and the last among them, with steps, seconds and returns. Thinning it again changes
@@ -385,18 +409,8 @@ def thin_metrics(path: Path) -> bytes:
         TsbenchError: the file is missing or damaged.
     """
     stages: dict[str, list[dict[str, Any]]] = {}
-    for row in read_metrics(path):
-        stage = row.get("stage")
-        kept: dict[str, Any] = {key: row.get(key) for key in ("steps", "seconds")}
-        kept |= {name: row[name] for name in RETURNS if name in row}
-        if len(kept) == 2:
-            continue
-        numbers = all(type(one) in (int, float) and abs(one) < LARGEST for one in kept.values())
-        if not (isinstance(stage, str) and len(stage) <= 64 and numbers):
-            raise TsbenchError(f"damaged metrics {path}: a row lacks its stage, steps or return")
-        stages.setdefault(stage, []).append({"stage": stage, **kept})
-        if len(stages) > MOST_STAGES:
-            raise TsbenchError(f"damaged metrics {path}: more than {MOST_STAGES} stages")
+    for stage, point in curve_points(path):
+        stages.setdefault(stage, []).append({"stage": stage, **point})
     lines = (json.dumps(rows[i]) for rows in stages.values() for i in thin(len(rows)))
     return "".join(f"{line}\n" for line in lines).encode()
 

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -88,7 +87,7 @@ def identity(config: RunConfig, problem: Problem) -> dict[str, Any]:
     return {
         "configuration": schema.identity_hash(asdict(config)),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        "packages": {name: plugins.version_of(name) for name in PACKAGES},
         "code": code.hexdigest(),
         "plug-ins": {
             provider.distribution: {"version": provider.version, "code": provider.code()}
@@ -113,13 +112,6 @@ def check_provenance(run: RunDirectory, config: RunConfig, problem: Problem) -> 
                 f"{run.path} was begun with another {_NAMES[name]} (see {run.versions_file}), "
                 "so an exact resume is impossible: begin it again elsewhere"
             )
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _commit() -> str | None:

@@ -35,6 +35,7 @@ from tsbench.runs.directory import (
     MAX_SCORE,
     RunDirectory,
     Stage,
+    curve_points,
     read_metrics,
     standard_name,
     thin,
@@ -276,13 +277,9 @@ def read_curves(metrics: Path) -> tuple[Curve, ...]:
     if not metrics.exists():
         return ()
     found: dict[str, list[tuple[float, float, float]]] = {}
-    for row in read_metrics(metrics):
-        try:
-            if MEASURE in row:
-                point = (row["steps"], row["seconds"], row[MEASURE])
-                found.setdefault(row["stage"], []).append(point)
-        except (KeyError, TypeError) as error:
-            raise TsbenchError(f"damaged metrics {metrics}: {error}") from None
+    for stage, point in curve_points(metrics):
+        if MEASURE in point:
+            found.setdefault(stage, []).append((point["steps"], point["seconds"], point[MEASURE]))
     return tuple(Curve(stage, *_thinned(points)) for stage, points in found.items())
 
 

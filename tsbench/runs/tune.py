@@ -112,7 +112,7 @@ class Study:
 
     def chosen(self, settings: Mapping[str, Any]) -> list[str]:
         """The words of `tsbench run` for some settings."""
-        return [*self.words, *(f"{key}={_word(value)}" for key, value in settings.items())]
+        return [*self.words, *(f"{key}={config.word(value)}" for key, value in settings.items())]
 
     def run(self, trial: int, settings: Mapping[str, Any], seed: int) -> RunConfig:
         made = config.compose([*self.chosen(settings), f"seed={seed}"])
@@ -343,12 +343,6 @@ def _sampler(trial: int) -> TPESampler:
         return TPESampler(
             multivariate=True, group=True, n_startup_trials=FIRST_TRIALS, seed=FIRST_SEED + trial
         )
-
-
-def _word(value: Any) -> str:
-    if value is None:
-        return "null"
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _mend(journal: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +14,6 @@ from tsbench.sim.change import Change
 from tsbench.sim.dynamics import Engine
 from tsbench.sim.physics import Physics
 from tsbench.sim.push import Push, direction
-
-# Scripted actions of n episodes, (steps, n, action_size), within [-1, 1].
-Script = Callable[[Task[Any], np.random.Generator, int], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -74,7 +70,6 @@ def one_step_gaps(
     seed: int = 0,
     change: Change | None = None,
     pushed: float = 0.0,
-    script: Script = wavering,
 ) -> Gaps:
     """Every step of some episodes in C MuJoCo, played in the other engine from the same place.
 
@@ -88,10 +83,9 @@ def one_step_gaps(
         seed: of starts, actions and pushes.
         change: to both physics.
         pushed: newtons at most of a push that covers a part of each step, at any heading.
-        script: of the actions.
     """
     rng = np.random.default_rng(seed)
-    actions = script(task, rng, episodes)
+    actions = wavering(task, rng, episodes)
     physics: Physics[Any] = Physics(task, episodes, change=change, perturbed=True, threads=1)
     state = physics.begin(rng, np.arange(episodes))
     begins, afters, pushes = [], [], []
@@ -112,19 +106,12 @@ def one_step_gaps(
     return _gaps(task, known.place(np.arange(count), first), scripted, wanted, before, found)
 
 
-def whole_episode_gaps(
-    task: Task[Any],
-    engine: Engine,
-    *,
-    episodes: int = 4,
-    seed: int = 0,
-    script: Script = wavering,
-) -> Gaps:
+def whole_episode_gaps(task: Task[Any], engine: Engine, *, episodes: int = 4) -> Gaps:
     """Whole episodes in both engines from the same starts under the same actions; the largest
     difference so far grows with every step. Over the steps of all episodes, in C MuJoCo's count:
     what comes after its ending is left out."""
-    rng = np.random.default_rng(seed)
-    actions = script(task, rng, episodes)
+    rng = np.random.default_rng(0)
+    actions = wavering(task, rng, episodes)
     start = task.start(rng, episodes, perturbed=True)
     rows = np.arange(episodes)
     physics, other = Physics(task, episodes, threads=1), engine(task, episodes, threads=1)

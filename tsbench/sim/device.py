@@ -161,14 +161,14 @@ class Replayed(Generic[T]):
                 self._function(*copies)
         torch.cuda.current_stream(self._device).wait_stream(aside)
         graph = torch.cuda.CUDAGraph()
-        with _no_garbage_collection(), torch.cuda.graph(graph, stream=aside):
+        with no_garbage_collection(), torch.cuda.graph(graph, stream=aside):
             self._result = self._function(*copies)
         return graph
 
 
 @contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """A collection during a recording could free device memory, which the recording forbids."""
+def no_garbage_collection() -> Iterator[None]:
+    """A collection while a GPU records could free device memory, which the recording forbids."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -29,6 +29,16 @@ _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 _NUMBER = 1  # index of the number of warnings of a kind in `Batch.warning`
 
 
+def compiled(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
+    """The model of a task's full physics, without what is only drawn: 10 % faster, the same states
+    to the last bit."""
+    spec = task.plant.spec()
+    spec.compiler.discardvisual = True
+    model = spec.compile()
+    (change or Change()).apply(model)
+    return model
+
+
 class Physics(Generic[S]):
     """A task's full physics.
 
@@ -71,12 +81,8 @@ class Physics(Generic[S]):
         self.seconds = 0.0
         self.warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), int)
         self.diverged = np.zeros(0, int)
-        spec = self.plant.spec()
-        spec.compiler.discardvisual = True  # 10 % faster, the same states to the last bit
-        model = spec.compile()
-        change = change or Change()
-        change.apply(model)
-        self._nstep = self.plant.substeps * change.refine  # in a control step
+        model = compiled(task, change)
+        self._nstep = self.plant.substeps * (change or Change()).refine  # in a control step
         # With memory of its own a simulation goes on from the sensors that were brought up to date,
         # which otherwise costs half a substep; among twenty substeps that does not pay.
         self.batch = Batch(model, count, threads or 0, persistent=self._nstep == 1)

@@ -16,7 +16,6 @@ times as much (H200, 8,192 worlds).
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -31,10 +30,10 @@ from tsbench.core.errors import TsbenchError
 from tsbench.core.state import Readings, Rng, S, Start
 from tsbench.core.task import SimulatedTask
 from tsbench.sim.change import Change
-from tsbench.sim.device import Replayed, merged
+from tsbench.sim.device import Replayed, at_device, merged, no_garbage_collection, tensor
 from tsbench.sim.disturbed import Disturbances, physics_factors, variants
 from tsbench.sim.model import sensor_slices
-from tsbench.sim.physics import Physics
+from tsbench.sim.physics import Physics, compiled
 from tsbench.sim.push import Push
 
 try:
@@ -312,17 +311,7 @@ class Worlds:
         with self._stream():
             self._sense()
 
-    def readings(self, time: torch.Tensor, memory: torch.Tensor) -> Readings:
-        """Copies of what a task reads, because the next step overwrites the arrays."""
-        return Readings(
-            time=time,
-            qpos=self.qpos.clone(),
-            qvel=self.qvel.clone(),
-            sensors=self.sensors(self.sensordata.clone()),
-            memory=memory,
-        )
-
-    def sensors(self, sensordata: torch.Tensor) -> dict[str, torch.Tensor]:
+    def sensors(self, sensordata: Array) -> dict[str, Array]:
         """The values of each sensor by name, each (n, dim), in the values of all (n, sizes)."""
         return {name: sensordata[:, part] for name, part in self._sensors.items()}
 
@@ -366,14 +355,8 @@ class Worlds:
             self._launch()  # compiles and loads the kernels, which a recording must not
             wp.synchronize_device(self._device)
             wanted = torch.cat([self.qpos[0], self.qvel[0]]).clone()
-            collects = gc.isenabled()
-            gc.disable()  # freeing an array while a GPU records would spoil the recording
-            try:
-                with wp.ScopedCapture(device=self._device) as capture:
-                    self._launch()
-            finally:
-                if collects:
-                    gc.enable()
+            with no_garbage_collection(), wp.ScopedCapture(device=self._device) as capture:
+                self._launch()
         self._rest()
         with self._stream():
             wp.capture_launch(capture.graph)
@@ -534,7 +517,7 @@ class WarpPhysics(Generic[S]):
         self.device = _exact(device)
         self.pool = pool
         self._substeps = self.plant.substeps * (change or Change()).refine
-        model = _model(task, change)
+        model = compiled(task, change)
         rng = np.random.default_rng(seed)
         factors = physics_factors(disturbances, rng, min(count, PHYSICS))
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
@@ -576,7 +559,7 @@ class WarpPhysics(Generic[S]):
         ]
         self._count = wp.from_torch(self._steps)
         of_world = factors[np.arange(count) % len(factors)] if len(factors) else np.ones((count, 0))
-        self._factors = tuple(self._tensor(column) for column in of_world.T)
+        self._factors = tuple(tensor(column, self.device) for column in of_world.T)
         # What only computes, as graphs of its own on a GPU.
         self._controlled = Replayed(self.plant.control, self.device)
         self._followed = Replayed(self._follow, self.device)
@@ -680,8 +663,8 @@ class WarpPhysics(Generic[S]):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restores the state of a snapshot of an object that was made alike."""
-        for name, tensor in self._kept().items():
-            tensor.copy_(torch.as_tensor(np.asarray(snapshot[name])))
+        for name, array in self._kept().items():
+            array.copy_(torch.as_tensor(np.asarray(snapshot[name])))
 
     def _kept(self) -> dict[str, torch.Tensor]:
         worlds = self.worlds
@@ -714,12 +697,8 @@ class WarpPhysics(Generic[S]):
             block = start.rows(slice(first, first + size))
             states.append(physics.place(np.arange(len(block.time)), block))
         state = type(states[0]).joined(states)
-        fresh = state.replace(**{name: self._tensor(value) for name, value in vars(state).items()})
-        return (self._tensor(start.qpos), self._tensor(start.qvel)), fresh
-
-    def _tensor(self, values: np.ndarray) -> torch.Tensor:
-        kind = torch.float32 if values.dtype.kind == "f" else None
-        return torch.as_tensor(values, dtype=kind, device=self.device)
+        places = (tensor(start.qpos, self.device), tensor(start.qvel, self.device))
+        return places, at_device(state, self.device)
 
 
 class HostPhysics(Generic[S]):
@@ -740,22 +719,17 @@ class HostPhysics(Generic[S]):
         count: int,
         *,
         threads: int | None = None,
-        perturbed: bool = False,
-        push: Push | None = None,
         change: Change | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         """`device` None means a GPU where there is one; `threads` has no effect.
 
         Raises:
-            TsbenchError: there are more or fewer pushes than simulations, or no such device.
+            TsbenchError: there is no such device.
         """
-        if push is not None:
-            push.expect_count(count)
         self.task = task
         self.plant = task.plant
-        self.perturbed = perturbed
-        self.push = push
+        self.push: Push | None = None
         self.substeps = 0
         self.seconds = 0.0
         self.diverged = np.zeros(0, int)
@@ -763,7 +737,7 @@ class HostPhysics(Generic[S]):
         self.device = _exact(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         self.side_by_side = Physics.side_by_side if self.device.type == "cpu" else 4096
         self.worlds = Worlds(
-            _model(task, change),
+            compiled(task, change),
             count,
             device=self.device,
             pushed=self.plant.pushed,
@@ -772,7 +746,7 @@ class HostPhysics(Generic[S]):
         )
 
     def begin(self, rng: Rng, rows: np.ndarray) -> S:
-        return self.place(rows, self.task.start(rng, len(rows), perturbed=self.perturbed))
+        return self.place(rows, self.task.start(rng, len(rows)))
 
     def place(self, rows: np.ndarray, start: Start) -> S:
         """Puts the simulations in `rows` where `start` says and returns their states."""
@@ -822,10 +796,11 @@ class HostPhysics(Generic[S]):
         return torch.tensor(np.array(values), dtype=torch.float32, device=self.device)
 
     def _read(self, rows: np.ndarray, time: np.ndarray, memory: np.ndarray) -> S:
-        nowhere = self.worlds.time[:, None][:, :0]
-        found = self.worlds.readings(self.worlds.time, nowhere)
-        sensors = {name: _host(values)[rows] for name, values in found.sensors.items()}
-        qpos, qvel = _host(found.qpos)[rows], _host(found.qvel)[rows]
+        worlds = self.worlds
+        qpos, qvel, sensordata = (
+            _host(array)[rows] for array in (worlds.qpos, worlds.qvel, worlds.sensordata)
+        )
+        sensors = worlds.sensors(sensordata)
         return self.plant.read(
             Readings(time=time, qpos=qpos, qvel=qvel, sensors=sensors, memory=memory)
         )
@@ -850,11 +825,3 @@ def _exact(device: torch.device | str) -> torch.device:
     if number >= torch.cuda.device_count():
         raise TsbenchError(f"there is no {device}: torch finds {torch.cuda.device_count()} GPUs")
     return torch.device("cuda", number)
-
-
-def _model(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
-    spec = task.plant.spec()
-    spec.compiler.discardvisual = True
-    model = spec.compile()
-    (change or Change()).apply(model)
-    return model

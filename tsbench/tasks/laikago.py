@@ -550,7 +550,7 @@ class Laikago(Plannable[LaikagoState]):
         times = np.arange(steps + 1) * self.timestep
         plan = self._continued(plan)
         base = scipy.interpolate.PchipInterpolator(plan.times, plan.states[:, :3])(times)
-        qpos, _ = poses(base, self._feet(plan, times))
+        qpos = poses(base, self._feet(plan, times))
         model = compiled("laikago")
         data = mujoco.MjData(model)
         qvel = np.zeros((len(times), model.nv))
@@ -764,7 +764,7 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         return xp.concat([state.base_position, feet], axis=-1)
 
     def poses(self, coordinates: np.ndarray) -> np.ndarray:
-        return poses(coordinates[:, :3], coordinates[:, 3:].reshape(-1, 4, 3))[0]
+        return poses(coordinates[:, :3], coordinates[:, 3:].reshape(-1, 4, 3))
 
     def roadmap_space(self) -> LaikagoSpace:
         return LaikagoSpace(self)
@@ -781,7 +781,6 @@ class LaikagoSpace(RoadmapSpace[LaikagoState]):
     """
 
     def __init__(self, abstraction: LaikagoAbstraction) -> None:
-        self.abstraction, self.gait = abstraction, abstraction.gait
         reach, goal = np.full(4, PLAN_REACH), abstraction.task.distance
         beside = C.goal_tolerance / 2
         self.low = np.array([-beside, -beside, PLAN_HEIGHT[0], *-reach])
@@ -920,16 +919,15 @@ class LaikagoTracker(Tracker[LaikagoState]):
         return Start(time, qpos, qvel, filter_memory(qpos[:, 7:]))
 
 
-def poses(base: np.ndarray, feet: np.ndarray) -> tuple[np.ndarray, float]:
-    """Generalised positions (k, 19) for level bases (k, 3) and foot centres (k, 4, 3), and the
-    largest distance in metres that inverse kinematics left between foot and target."""
+def poses(base: np.ndarray, feet: np.ndarray) -> np.ndarray:
+    """Generalised positions (k, 19) for level bases (k, 3) and foot centres (k, 4, 3)."""
     model = compiled("laikago")
     solver = FootPoses(model, FEET, model.key("home").qpos)
     solutions = [
         solver.solve(np.concatenate([position, [1.0, 0.0, 0.0, 0.0]]), targets)
         for position, targets in zip(base, feet, strict=True)
     ]
-    return np.array([q for q, _ in solutions]), max(residual for _, residual in solutions)
+    return np.array([pose for pose, _ in solutions])
 
 
 @cache

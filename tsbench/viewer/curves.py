@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tsbench.core.errors import TsbenchError
 from tsbench.core.files import write_new
-from tsbench.runs.directory import LARGEST, MOST_STAGES, read_metrics
+from tsbench.runs.directory import curve_points
 
-Curve = tuple[list[Any], list[Any]]  # environment steps, returns
+Curve = tuple[list[float], list[float]]  # environment steps, returns
 
 MEASURE = "episode_return"
 
@@ -28,17 +26,11 @@ def read_curves(metrics: Path) -> dict[str, Curve]:
         TsbenchError: the file is damaged.
     """
     curves: dict[str, Curve] = {}
-    for row in read_metrics(metrics):
-        if MEASURE not in row:
-            continue
-        stage, point = row.get("stage"), [row.get("steps"), row[MEASURE]]
-        numbers = all(isinstance(one, (int, float)) and abs(one) < LARGEST for one in point)
-        if not (isinstance(stage, str) and numbers):
-            raise TsbenchError(f"damaged metrics {metrics}: a row lacks its stage, steps or return")
-        for values, one in zip(curves.setdefault(stage, ([], [])), point, strict=True):
-            values.append(one)
-        if len(curves) > MOST_STAGES:
-            raise TsbenchError(f"damaged metrics {metrics}: more than {MOST_STAGES} stages")
+    for stage, point in curve_points(metrics):
+        if MEASURE in point:
+            steps, returns = curves.setdefault(stage, ([], []))
+            steps.append(point["steps"])
+            returns.append(point[MEASURE])
     return curves
 
 

@@ -386,7 +386,6 @@ def render(show: Show, *, served: bool = False) -> str:
         "spheres": np.column_stack([view.centres, view.radii]).round(3).tolist(),
         "size": view.size,
         "direction": view.direction,
-        "flat": view.flat,
         "sky": "rgb({}, {}, {})".format(*SKY),
         "actors": cast,
         "labels": labels,

@@ -23,7 +23,8 @@ def call(words: Sequence[str]) -> None:
     report.check_finished(run)
     path = options.html or run.report_file
     check_ending(path, ".html")
-    check_new(path, "give another by --html FILE")
+    if options.html or run.view_file.exists():
+        check_new(path, "give another by --html FILE")
     if options.html:
         write_new(path, report.render(run).encode())
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from tsbench.cli import places
@@ -93,5 +94,5 @@ def call(words: Sequence[str]) -> int:
             sys.stdout.write(f"{place}\n")
     finally:
         submission.discard(packed)
-    write_json(options.json, verify.plain(verdict))
+    write_json(options.json, asdict(verdict))
     return int(not verdict.passed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from tsbench.cli import places
@@ -83,7 +84,7 @@ def call(words: Sequence[str]) -> int:
             sys.stdout.write(f"{place or kept}\n")
     if options.comment:
         write_new(options.comment, verify.comment(verdicts, faults).encode())
-    shown = {"refused": faults, "verdicts": [verify.plain(verdict) for verdict in verdicts]}
+    shown = {"refused": faults, "verdicts": [asdict(verdict) for verdict in verdicts]}
     write_json(options.json, shown)
     if options.retract is not None:
         return 0

@@ -78,8 +78,6 @@ def _ours(groups: Sequence[Group], group: Group) -> Group | None:
     defaults = papers_group(groups, group.task, OURS) or main_group(groups, group.task, OURS)
     if group is defaults:
         return None
-    if group is defaults:
-        return None
     if group.method == OURS or defaults is None or _effort(group) == _effort(defaults):
         return defaults
     alike = [one for one in groups if _effort(one) == _effort(group)]
