@@ -68,7 +68,7 @@ system:
 	@.ci/debian libosmesa6 chromium
 
 test: setup system $(EXTRAS)
-	$(BIN)/python -m pytest --numprocesses=auto $(ARGS)
+	$(BIN)/python -m pytest --numprocesses=auto --dist=worksteal $(ARGS)
 
 check: setup $(EXTRAS)
 	$(BIN)/ruff check .

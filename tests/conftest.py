@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable, Iterator
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
 
 # Set before numpy and torch are loaded, in the tests and in the commands that they start. Tests run
 # in parallel, and threads that wait for each other's cores slow a small network down tenfold.
@@ -27,6 +32,56 @@ from tsbench.testing.rounding import perturbed
 # The speed and the load of a machine are no property of the code.
 settings.register_profile("any", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any")
+
+
+_PROGRAM = """
+import os, runpy, sys
+os.chdir(folder)
+for number, name in enumerate(("out", "err"), 1):
+    os.dup2(os.open(f"{streams}/{name}", os.O_WRONLY | os.O_CREAT), number)
+sys.path[:0] = path
+sys.argv = ["tsbench", *words]
+runpy.run_module("tsbench", run_name="__main__")
+"""
+
+
+class Forks:
+    """Starts processes in which torch and rsl-rl, which take seconds to load, are loaded already,
+    and nothing of tsbench.
+
+    Attributes:
+        context: of multiprocessing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.context = get_context("forkserver")
+        self.context.set_forkserver_preload(["torch", "tensordict", "rsl_rl.algorithms"])
+        self._folder, self._numbers = folder, itertools.count()
+
+    def start(self, folder: Path, *words: str, path: Sequence[Path] = ()) -> Any:
+        """Starts `tsbench WORDS` in a folder, with what lies in `path` installed."""
+        streams = self._folder / str(next(self._numbers))
+        streams.mkdir()
+        given = {
+            "folder": folder, "words": words, "path": list(map(str, path)), "streams": streams,
+        }  # fmt: skip
+        process = self.context.Process(target=exec, args=(_PROGRAM, given))
+        process.start()
+        return process, streams
+
+    def call(
+        self, folder: Path, *words: str, path: Sequence[Path] = ()
+    ) -> subprocess.CompletedProcess[str]:
+        """Carries out `tsbench WORDS` in a folder. See `start`."""
+        process, streams = self.start(folder, *words, path=path)
+        process.join()
+        out, err = ((streams / name).read_text() for name in ("out", "err"))
+        return subprocess.CompletedProcess(words, process.exitcode, out, err)
+
+
+@pytest.fixture(scope="session")
+def forks(tmp_path_factory: pytest.TempPathFactory) -> Forks:
+    return Forks(tmp_path_factory.mktemp("forks"))
 
 
 @pytest.fixture(scope="session", autouse=True)

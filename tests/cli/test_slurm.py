@@ -12,7 +12,7 @@ import pytest
 SCRIPT = Path(__file__).parents[2] / "examples" / "slurm" / "array.sh"
 WORDS = [
     "task=rocket_navigation", "method=monolithic", "budget=smoke", "checkpoint=0", "loggers=[]",
-    "task.budgets.smoke.act=20480",
+    "task.budgets.smoke.plan=2048", "task.budgets.smoke.act=4096",
 ]  # fmt: skip
 
 # The command. With HELD it waits in its second iteration for the signal that interrupts it.
@@ -34,7 +34,7 @@ sys.exit(cli.main())
 """
 
 # Starts the tasks of an array one after the other, and interrupts the first start of each while it
-# trains: task 0 by SIGTERM to the shell, as near the time limit, task 1 by the death of its node.
+# trains by SIGTERM to the shell, as near the time limit.
 SBATCH = """
 import os, pathlib, signal, subprocess, sys, time
 
@@ -61,11 +61,7 @@ for task in range(first, last + 1):
                 if any(path.read_bytes().count(b"\\n") > 1 for path in found):  # a checkpoint too
                     break
                 time.sleep(0.1)
-            if task == 0:
-                shell.send_signal(signal.SIGTERM)
-            else:
-                os.killpg(shell.pid, signal.SIGKILL)
-                asked.touch()
+            shell.send_signal(signal.SIGTERM)
         print("start", task, start, shell.wait(), asked.exists(), flush=True)
         if not asked.exists():
             break
@@ -79,8 +75,8 @@ def program(path: Path, code: str) -> None:
 
 
 def test_an_array_that_is_interrupted(tmp_path: Path) -> None:
-    """A task that is stopped or killed is started again and goes on where it was. That it then
-    ends with the bits of a run that was left alone, tests/runs/test_resume.py shows."""
+    """A task that is stopped is started again and goes on where it was. That it then ends with the
+    bits of a run that was left alone, tests/runs/test_resume.py shows."""
     programs = tmp_path / "bin"
     programs.mkdir()
     program(programs / "tsbench", f"#!{sys.executable}{TSBENCH}")
@@ -90,18 +86,14 @@ def test_an_array_that_is_interrupted(tmp_path: Path) -> None:
         "PYTHONPATH": os.pathsep.join(sys.path), "PATH": f"{programs}:{os.environ['PATH']}",
     }  # fmt: skip
     done = subprocess.run(
-        ["sbatch", "--array=0-1", str(SCRIPT), "run", "-m", *WORDS, "seed=%a"],
+        ["sbatch", "--array=0-0", str(SCRIPT), "run", "-m", *WORDS, "seed=%a"],
         cwd=tmp_path, env=environment, capture_output=True, text=True,
     )  # fmt: skip
     starts = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("start")]
-    assert starts == [
-        ["0", "0", "143", "True"], ["0", "1", "0", "False"],
-        ["1", "0", "-9", "True"], ["1", "1", "0", "False"],
-    ], done.stderr  # fmt: skip
-    for seed in (0, 1):
-        (run,) = (tmp_path / "runs/rocket_navigation/monolithic").glob(f"seed{seed}-*")
-        assert (run / "score.json").is_file()
-        assert "resumed: train goes on at" in (run / "log.txt").read_text()
+    assert starts == [["0", "0", "143", "True"], ["0", "1", "0", "False"]], done.stderr
+    (run,) = (tmp_path / "runs/rocket_navigation/monolithic").glob("seed0-*")
+    assert (run / "score.json").is_file()
+    assert "resumed: train goes on at" in (run / "log.txt").read_text()
 
 
 @pytest.mark.parametrize("status", [0, 2])

@@ -8,13 +8,16 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import tsbench
 from tsbench import tasks
 from tsbench.core import plugins
+
+if TYPE_CHECKING:
+    from tests.conftest import Forks
 
 SOME = tasks.names()[0]
 CONF = Path(tsbench.__file__).parent / "conf"
@@ -128,6 +131,11 @@ def call(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return python(folder, "-m", "tsbench", *words)
 
 
+def train(forks: Forks, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """As `call`, in a process in which torch is loaded already."""
+    return forks.call(folder, *words, path=[folder / "site"])
+
+
 def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Runs Python in `folder`, with the plug-ins in its `site` installed."""
     path = os.pathsep.join([str(Path(tsbench.__file__).parents[1]), str(folder / "site")])
@@ -155,7 +163,7 @@ RUN = ["run", "task=toy_flight", "method=lazy", "budget=smoke", "threads=1"]
 QUICK = [*RUN, "task.budgets.smoke.plan=512", "task.budgets.smoke.act=512"]
 
 
-def test_a_plugin_is_as_good_as_what_is_built_in(toy: Toy, tmp_path: Path) -> None:
+def test_a_plugin_is_as_good_as_what_is_built_in(forks: Forks, toy: Toy, tmp_path: Path) -> None:
     content = listed(tmp_path)
     assert "toy_flight" in content["tasks"]
     assert set(content["tasks"]["toy_flight"]["budgets"]) == {"smoke", "fast", "paper"}
@@ -163,7 +171,7 @@ def test_a_plugin_is_as_good_as_what_is_built_in(toy: Toy, tmp_path: Path) -> No
     assert content["plug-ins"] == {"toy-tasks 1.0": ["toy_flight", "lazy"]}
     assert content["refused"] == []
 
-    done = call(tmp_path, *QUICK, "directory=run")
+    done = train(forks, tmp_path, *QUICK, "directory=run")
     assert done.returncode == 0, done.stderr
     versions = json.loads((tmp_path / "run" / "versions.json").read_text())
     assert versions["plug-ins"].keys() == {"toy-tasks"}
@@ -183,15 +191,15 @@ def test_a_plugin_is_as_good_as_what_is_built_in(toy: Toy, tmp_path: Path) -> No
     assert "toy-tasks 1.0 there, 1.1 here" in done.stdout
 
 
-def test_the_runs_of_a_sweep(toy: Toy, tmp_path: Path) -> None:
-    done = call(tmp_path, *QUICK, "-m", "seed=0,1")
+def test_the_runs_of_a_sweep(forks: Forks, toy: Toy, tmp_path: Path) -> None:
+    done = train(forks, tmp_path, *QUICK, "-m", "seed=0,1")
     assert done.returncode == 0, done.stderr
     assert len(list(tmp_path.glob("runs/toy_flight/lazy/*/score.json"))) == 2
 
 
-def test_another_plugin_does_not_go_on_with_a_run(toy: Toy, tmp_path: Path) -> None:
+def test_another_plugin_does_not_go_on_with_a_run(forks: Forks, toy: Toy, tmp_path: Path) -> None:
     """A run is not resumed with another version of its plug-in, nor with other code."""
-    done = call(tmp_path, *QUICK, "directory=run")
+    done = train(forks, tmp_path, *QUICK, "directory=run")
     assert done.returncode == 0, done.stderr
     (tmp_path / "run" / "score.json").unlink()  # as if it had been interrupted at its very end
     for path, old, new in (
@@ -200,7 +208,7 @@ def test_another_plugin_does_not_go_on_with_a_run(toy: Toy, tmp_path: Path) -> N
     ):
         before = path.read_text()
         path.write_text(before.replace(old, new))
-        done = call(tmp_path, "run", "resume=run")
+        done = train(forks, tmp_path, "run", "resume=run")
         assert done.returncode == 2
         assert "was begun with another version of a plug-in" in done.stderr
         assert len(done.stderr.splitlines()) == 1
@@ -292,12 +300,12 @@ def test_a_broken_plugin_breaks_nothing_else(file: str, toy: Toy, tmp_path: Path
     assert call(tmp_path, "describe", SOME).returncode == 0
 
 
-def test_a_broken_method_is_told_when_it_is_used(toy: Toy, tmp_path: Path) -> None:
+def test_a_broken_method_is_told_when_it_is_used(forks: Forks, toy: Toy, tmp_path: Path) -> None:
     (toy.folder / "lazy.py").write_text(
         '"""Lazy: it fails when it is imported, not before."""\n1/0'
     )
     assert listed(tmp_path)["methods"]["lazy"].startswith("Lazy: it fails")
-    done = call(tmp_path, *RUN)
+    done = train(forks, tmp_path, *RUN)
     assert done.returncode == 2
     assert done.stderr == (
         "tsbench: the plug-in toy-tasks 1.0 cannot be used: ZeroDivisionError: division by zero\n"
@@ -314,21 +322,21 @@ def test_a_broken_method_is_told_when_it_is_used(toy: Toy, tmp_path: Path) -> No
     ],
 )
 def test_a_method_that_returns_something_else(
-    toy: Toy, tmp_path: Path, right: str, wrong: str, given: str
+    forks: Forks, toy: Toy, tmp_path: Path, right: str, wrong: str, given: str
 ) -> None:
     (toy.folder / "lazy.py").write_text(METHOD.replace(right, wrong))
-    done = call(tmp_path, *QUICK)
+    done = train(forks, tmp_path, *QUICK)
     assert done.returncode == 2
     line = f"tsbench: the method lazy returns {given}"
     assert done.stderr.splitlines()[-1].startswith(line)
 
 
-def test_a_method_that_goes_beyond_its_budget(toy: Toy, tmp_path: Path) -> None:
+def test_a_method_that_goes_beyond_its_budget(forks: Forks, toy: Toy, tmp_path: Path) -> None:
     more = "replace(problem, budget=replace(problem.budget, act=20 * problem.budget.act))"
     (toy.folder / "lazy.py").write_text(
         METHOD.replace("= twostage.train(problem,", f"= twostage.train({more},")
     )
-    done = call(tmp_path, *QUICK)
+    done = train(forks, tmp_path, *QUICK)
     assert done.returncode == 0, done.stderr
     line = "over the budget, so no leaderboard takes this run: stages of 10,752 steps, where the"
     assert line in done.stdout

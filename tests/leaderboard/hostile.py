@@ -680,10 +680,32 @@ def entries(folder: Path) -> None:
         shutil.rmtree(board, ignore_errors=True)
 
 
+def once(make: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that is called the first time alone, and returns that result ever after."""
+    made: list[Any] = []
+
+    def again(*given: Any) -> Any:
+        if not made:
+            made.append(make(*given))
+        return made[0]
+
+    return again
+
+
+def draw_once() -> None:
+    """Records and draws once what no score changes, since every case is of the same run."""
+    from tsbench.viewer import charts, report  # matplotlib, which a reader's memory lacks
+
+    names = [(charts, name) for name in ("learning", "contacts", "rewards", "joints")]
+    for module, name in [(report, "record_episode"), *names]:
+        setattr(module, name, once(getattr(module, name)))
+
+
 def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> None:
     whole = intact(folder / "whole") / "seed0"
     found = run_cases([chosen] if chosen else [*READ_BY], only is None)
     if only in ("scores", "edges"):
+        draw_once()
         edges = {place: values[-1:] for place, values in EDGES.items()}
         found = score_cases(edges if only == "edges" else {**SCORE, **EDGES})
     for verb, case, change in found:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,13 +205,30 @@ def test_damaged_curves_are_one_line(
     run, curves = begin(tmp_path / "run", ROCKET), tmp_path / "out" / results.CURVES
     finish(run, invented_record("rocket_navigation"))
     results.collect(results.read([run.path]), curves.parent)
-    content = curves.read_bytes()
-    for place in range(0, len(content), 7):
+    content, told = curves.read_bytes(), []
+    places = range(0, len(content), 7)
+    for place in places:
         spoilt = bytearray(content)
         spoilt[place : place + 40] = bytes(byte ^ 0xFF for byte in spoilt[place : place + 40])
         curves.write_bytes(spoilt)
-        with contextlib.suppress(TsbenchError):
+        try:
             results.load(curves.parent)
+        except TsbenchError as error:
+            told.append(str(error))
+    assert len(told) > 0.5 * len(places)
+    assert all(str(curves) in line and "\n" not in line for line in told)
+
+
+@pytest.mark.parametrize("steps", ["many", None, 1e300])
+def test_damaged_metrics_are_one_line(
+    tmp_path: Path, invented_record: Callable[[str], Record], steps: Any
+) -> None:
+    run = begin(tmp_path / "run", ROCKET)
+    finish(run, invented_record("rocket_navigation"))
+    row = {"stage": "plan", "steps": steps, "seconds": 1.0, "normalized_return": 0.5}
+    run.metrics_file.write_text(json.dumps(row) + "\n")
+    with pytest.raises(TsbenchError, match=r"damaged metrics .*: a row lacks its stage, steps"):
+        results.read([run.path])
 
 
 @pytest.mark.parametrize("arrays", [{"loss": np.zeros(3)}, {"a b": np.zeros((3, 4))}])

@@ -8,11 +8,12 @@ import json
 import math
 import os
 import re
+import resource
 import shutil
 import signal
-import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -442,27 +443,34 @@ def test_a_policy_is_refused_where_it_does_not_belong(
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@contextmanager
+def no_file_beyond(size: int) -> Iterator[None]:
+    """Has the system refuse every write with which a file would have more bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
 @pytest.mark.parametrize("size", [600, 30_000, 300_000])
-def test_a_full_disk_stops_a_run_in_one_line(size: int, tmp_path: Path) -> None:
-    """No file may exceed `size` bytes: the system refuses a write at some point of the run."""
-    program = (
-        "import resource, sys\n"
-        "from tsbench.cli import main\n"
-        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))\n"
-        f"sys.exit(main(['run', *{WORDS!r}, 'directory=mine']))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert done.returncode == 2
-    assert done.stderr.startswith("tsbench: ")
-    assert "mine" in done.stderr
-    assert "File too large" in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_a_full_disk_stops_a_run_in_one_line(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At some point of the run."""
+    monkeypatch.chdir(tmp_path)
+    with no_file_beyond(size):
+        assert cli.main(["run", *WORDS, "directory=mine"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("tsbench: ")
+    assert "mine" in error
+    assert "File too large" in error
+    assert error.count("\n") == 1
     run = RunDirectory(tmp_path / "mine")
     assert run.finished == (size == 300_000)  # with this size only the pages are too large
     if run.finished:
-        assert done.stderr.endswith("its pages are not: tsbench report mine\n")
+        assert error.endswith("its pages are not: tsbench report mine\n")
         assert not run.report_file.exists()
 
 
@@ -572,19 +580,22 @@ SHORT = [
 PAGES = {"learning_curves.png", "view.html", "report.html"}
 
 
-@pytest.mark.parametrize("words", [["report", "one"], ["run", "resume=one"]])
+@pytest.mark.parametrize(
+    ("words", "page"),
+    [(["report", "one"], "view.html"), (["run", "resume=one"], "report.html")],
+)
 def test_pages_that_a_finished_run_lacks_are_made(
-    words: list[str], finished: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], page: str, finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """They are made from the run's directory alone, and existing pages stay."""
     before = {name: (finished / name).read_bytes() for name in PAGES}
-    for name in PAGES - {"view.html"}:
+    for name in PAGES - {page}:
         (finished / name).unlink()
-    (finished / "view.html").write_text("mine")
+    (finished / page).write_text("mine")
     assert cli.main(words) == 0
     assert names(finished) == EVERYTHING
     after = {name: (finished / name).read_bytes() for name in PAGES}
-    assert after == before | {"view.html": b"mine"}
+    assert after == before | {page: b"mine"}
     capsys.readouterr()
     assert cli.main(words) == 2
     assert capsys.readouterr().err.count("\n") == 1

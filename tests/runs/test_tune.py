@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from optuna.samplers import TPESampler
@@ -24,6 +22,9 @@ from tsbench.runs import config, execute, tune
 from tsbench.runs.directory import RunDirectory
 from tsbench.runs.schema import RunConfig
 from tsbench.runs.tune import Dimension, Study
+
+if TYPE_CHECKING:
+    from tests.conftest import Forks
 
 KEY = "task.training.task.entropy"
 WORDS = ("task=rocket_navigation", "method=monolithic", "budget=smoke")
@@ -239,13 +240,14 @@ def work(given: Study, count: int, gate: Path) -> None:
 
 def wait(ready: Callable[[], bool]) -> None:
     until = time.monotonic() + 300
-    while not ready() and time.monotonic() < until:
+    while not ready():
+        assert time.monotonic() < until, "the other process does not come so far"
         time.sleep(0.01)
 
 
-def test_processes_share_a_study(tmp_path: Path) -> None:
+def test_processes_share_a_study(tmp_path: Path, forks: Forks) -> None:
     """Two processes at once do four trials: each once, by one process, with its own values."""
-    given, gate, context = study(tmp_path), tmp_path / "gate", get_context("spawn")
+    given, gate, context = study(tmp_path), tmp_path / "gate", forks.context
     workers = [context.Process(target=work, args=(given, 4, gate)) for _ in range(2)]
     for worker in workers:
         worker.start()
@@ -265,9 +267,9 @@ def test_processes_share_a_study(tmp_path: Path) -> None:
     assert workers_of[0] != workers_of[1]
 
 
-def test_a_killed_process_leaves_its_trial_to_others(tmp_path: Path) -> None:
+def test_a_killed_process_leaves_its_trial_to_others(tmp_path: Path, forks: Forks) -> None:
     """The trial keeps its settings. What the dying process wrote last may be cut off."""
-    given, gate, context = study(tmp_path), tmp_path / "gate", get_context("spawn")
+    given, gate, context = study(tmp_path), tmp_path / "gate", forks.context
     worker = context.Process(target=work, args=(given, 2, gate))
     worker.start()
     wait((given.place(0) / f"seed{tune.FIRST_SEED + 1}" / "by").exists)
@@ -317,16 +319,15 @@ def test_wrong_ranges(values: dict[str, Any], line: str) -> None:
 
 @pytest.mark.parametrize("method", OWN)
 def test_every_range_is_a_word_of_run(method: str) -> None:
-    """Both ends of every range and all choices make a configuration."""
+    """Both ends of every range and all choices make a configuration, all at once: no trial may
+    choose what the method refuses."""
     space = tune.search_space(method)
     prepared = tune.prepare(["task=rocket_navigation", f"method={method}"])
     assert prepared.space == space
-    for key, dimension in space.items():
-        for value in dimension.choices or (dimension.low, dimension.high):
-            execute.prepare(prepared.run(0, {key: value}, 0))
-    for end in ("low", "high"):  # all at once: no trial may choose what the method refuses
-        ends = {key: getattr(one, end) for key, one in space.items() if not one.choices}
-        execute.prepare(prepared.run(0, ends, 0))
+    for turn in range(max(2, *(len(one.choices) for one in space.values()))):
+        values = {key: one.choices or (one.low, one.high) for key, one in space.items()}
+        chosen = {key: ends[turn % len(ends)] for key, ends in values.items()}
+        execute.prepare(prepared.run(0, chosen, 0))
 
 
 @pytest.mark.parametrize(
@@ -377,34 +378,25 @@ def test_without_optuna(
     assert error == "tsbench: optuna is missing: pip install 'tsbench[tune]'\n"
 
 
-def command(folder: Path, *words: str) -> list[str]:
-    return [sys.executable, "-m", "tsbench", "tune", *WORDS, "study=s", "threads=1", *words]
-
-
-def test_the_command_goes_on_after_a_kill(tmp_path: Path) -> None:
+def test_the_command_goes_on_after_a_kill(tmp_path: Path, forks: Forks) -> None:
     """Real runs: killed while the second seed trains, then resumed; finished runs are kept."""
     small = "task.budgets.smoke.act=512", "task.budgets.smoke.plan=512"
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    words = command(tmp_path, *small, "trials=1")
-    first = subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
+    words = ["tune", *WORDS, "study=s", "threads=1", *small]
+    first, _ = forks.start(tmp_path, *words, "trials=1")
     runs = tmp_path / "s" / "trial0"
     wait((runs / "seed1000001" / "config.yaml").exists)
     first.kill()
-    first.wait()
+    first.join()
     kept = (runs / "seed1000000" / "score.json").stat().st_mtime_ns
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    done = forks.call(tmp_path, *words, "trials=1")
     assert done.returncode == 0, done.stderr
     assert (runs / "seed1000000" / "score.json").stat().st_mtime_ns == kept
     assert all((runs / f"seed{1_000_000 + i}" / "score.json").is_file() for i in range(3))
     line = done.stdout.splitlines()[-1]
-    again = subprocess.run(
-        command(tmp_path, *small, "--best", "--json", "best.json"),
-        cwd=tmp_path, env=environment, capture_output=True, text=True,
-    )  # fmt: skip
+    again = forks.call(tmp_path, *words, "--best", "--json", "best.json")
     assert again.stdout == f"{line}\n"
     assert again.stderr.startswith("trial 0 is the best of 1 trial, worth ")
-    other = command(tmp_path, "task.budgets.smoke.act=256", "--best")
-    refused = subprocess.run(other, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    refused = forks.call(tmp_path, *words[:-2], "task.budgets.smoke.act=256", "--best")
     assert refused.returncode == 2
     said = f"with {' '.join(small)}, without task.budgets.smoke.act=256"
     assert said in refused.stderr
