@@ -443,7 +443,8 @@ def test_a_finished_run_is_not_resumed(
     uninterrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(uninterrupted, tmp_path / "run")
-    (tmp_path / "run" / "report.html").touch()
+    for page in ("view.html", "report.html"):
+        (tmp_path / "run" / page).touch()
     assert cli.main(["run", f"resume={tmp_path / 'run'}"]) == 2
     assert capsys.readouterr().err.endswith("a finished run: there is nothing to resume\n")
 
