@@ -579,9 +579,9 @@ ABSENT = {  # whose absence is no fault
 }  # fmt: skip
 
 
-def run_cases(verbs: list[str], contents: bool) -> Iterator[tuple[str, str, Change]]:
+def run_cases(*, contents: bool) -> Iterator[tuple[str, str, Change]]:
     """Verb, name, change."""
-    for verb in verbs:
+    for verb in READ_BY:
         for name in READ_BY[verb]:
             for kind in KINDS:
                 if (kind.__name__, name) in ABSENT or (name, kind) == ("metrics.jsonl", empty):
@@ -701,9 +701,9 @@ def draw_once() -> None:
         setattr(module, name, once(getattr(module, name)))
 
 
-def runs(folder: Path, chosen: str | None = None, only: str | None = None) -> None:
+def runs(folder: Path, only: str | None = None) -> None:
     whole = intact(folder / "whole") / "seed0"
-    found = run_cases([chosen] if chosen else [*READ_BY], only is None)
+    found = run_cases(contents=only is None)
     if only in ("scores", "edges"):
         draw_once()
         edges = {place: values[-1:] for place, values in EDGES.items()}
@@ -785,7 +785,6 @@ def main() -> None:
     parser.add_argument("what", choices=("entries", "runs", "fuzz"))
     parser.add_argument("count", nargs="?", type=int, default=300)
     parser.add_argument("--start", type=int, default=0, help="of the random numbers")
-    parser.add_argument("--verb", choices=READ_BY, help="of the runs, one alone")
     parser.add_argument("--only", choices=("kinds", "scores", "edges"), help="of the runs")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="hostile-") as folder:
@@ -793,7 +792,7 @@ def main() -> None:
         if options.what == "fuzz":
             fuzz(Path(folder), options.count, options.start)
         elif options.what == "runs":
-            runs(Path(folder), options.verb, options.only)
+            runs(Path(folder), options.only)
         else:
             entries(Path(folder))
         assert not list(Path(folder).rglob("pwned")), "code of an entry ran"

@@ -85,7 +85,7 @@ def _again(task: Task[Any], start: Start, actions: Array, rewards: Array) -> Sum
         rewards: that they earned, shape (T, n).
     """
     count = len(start.time)
-    physics: Physics[Any] = Physics(task, count)
+    physics: Physics[Any] = Physics(task, count, threads=1)
     begin = physics.place(np.arange(count), start)
     found = play(task, physics, actions, count, begin=begin, measure=task.measured)
     same = np.allclose(found.rewards, rewards, rtol=SAME_REWARD, atol=0.0)

@@ -29,7 +29,7 @@ _CURRENT = int(mujoco.mjtStage.mjSTAGE_VEL)
 _NUMBER = 1  # index of the number of warnings of a kind in `Batch.warning`
 
 
-def compiled(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
+def physics_model(task: SimulatedTask[Any], change: Change | None) -> mujoco.MjModel:
     """The model of a task's full physics, without what is only drawn: 10 % faster, the same states
     to the last bit."""
     spec = task.plant.spec()
@@ -81,7 +81,7 @@ class Physics(Generic[S]):
         self.seconds = 0.0
         self.warnings = np.zeros(int(mujoco.mjtWarning.mjNWARNING), int)
         self.diverged = np.zeros(0, int)
-        model = compiled(task, change)
+        model = physics_model(task, change)
         self._nstep = self.plant.substeps * (change or Change()).refine  # in a control step
         # With memory of its own a simulation goes on from the sensors that were brought up to date,
         # which otherwise costs half a substep; among twenty substeps that does not pay.

@@ -33,7 +33,7 @@ from tsbench.sim.change import Change
 from tsbench.sim.device import Replayed, at_device, merged, no_garbage_collection, tensor
 from tsbench.sim.disturbed import Disturbances, physics_factors, variants
 from tsbench.sim.model import sensor_slices
-from tsbench.sim.physics import Physics, compiled
+from tsbench.sim.physics import Physics, physics_model
 from tsbench.sim.push import Push
 
 try:
@@ -517,7 +517,7 @@ class WarpPhysics(Generic[S]):
         self.device = _exact(device)
         self.pool = pool
         self._substeps = self.plant.substeps * (change or Change()).refine
-        model = compiled(task, change)
+        model = physics_model(task, change)
         rng = np.random.default_rng(seed)
         factors = physics_factors(disturbances, rng, min(count, PHYSICS))
         pushes = math.ceil(task.horizon * task.timestep / disturbances.interval) + 1
@@ -737,7 +737,7 @@ class HostPhysics(Generic[S]):
         self.device = _exact(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         self.side_by_side = Physics.side_by_side if self.device.type == "cpu" else 4096
         self.worlds = Worlds(
-            compiled(task, change),
+            physics_model(task, change),
             count,
             device=self.device,
             pushed=self.plant.pushed,
