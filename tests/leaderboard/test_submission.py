@@ -73,6 +73,23 @@ def finished(shown: Path) -> Path:
     return Path("one")
 
 
+@pytest.fixture(scope="module")
+def board(shown: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A board with the finished run as its entry, which no test may change."""
+    path = tmp_path_factory.mktemp("boards") / "board"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PROTOCOLS, "quick", QUICK)
+        patch.setattr(protocols, "V1", QUICK)
+        assert cli.main(["submit", str(shown), "--name", "mine", *WHO[:-1], str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def entered(board: Path) -> None:
+    """A copy of the board, which tests may change: `ENTRY` lies in it."""
+    shutil.copytree(board, "board")
+
+
 def seeded(run: Path, seed: int) -> Path:
     """A copy of the run that says it is of another seed, wherever a run says it."""
     other = Path(f"seed{seed}")
@@ -166,8 +183,7 @@ def test_an_entry_is_verified_in_full_and_the_verdict_kept(
     assert verify.recorded(Path("board"), ENTRY) is None
 
 
-def test_a_kept_verdict_is_replaced_by_a_higher_state_or_a_failure(finished: Path) -> None:
-    assert submit("one") == 0
+def test_a_kept_verdict_is_replaced_by_a_higher_state_or_a_failure(entered: None) -> None:
     board = Path("board")
     first = verify.verify(ENTRY, verify.Asked(rescore=False))
     for state, passed, written in (
@@ -194,9 +210,8 @@ def test_a_kept_verdict_is_replaced_by_a_higher_state_or_a_failure(finished: Pat
 
 
 def test_a_board_keeps_verdicts_on_its_own_entries_alone(
-    finished: Path, capsys: pytest.CaptureFixture[str]
+    entered: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert submit("one") == 0
     shutil.copytree("board", "elsewhere")
     other = str("elsewhere" / ENTRY.relative_to("board"))
     for words in (["--record", "--quick"], ["--retract", "a bug"]):
@@ -244,9 +259,8 @@ def test_an_entry_keeps_the_learning_curves(
     ],
 )
 def test_an_entry_keeps_nothing_but_curves(
-    change: dict[str, Any], line: str, finished: Path
+    change: dict[str, Any], line: str, entered: None
 ) -> None:
-    assert submit("one") == 0
     metrics = ENTRY / "seed3" / "metrics.jsonl"
     first, *others = metrics.read_text().splitlines()
     text = "\n".join([json.dumps({**json.loads(first), **change}), *others, ""])
@@ -507,13 +521,11 @@ OTHERS = "move it there, or submit its runs by another name"
     ],
 )
 def test_an_entry_that_was_moved_or_changed(
-    finished: Path, capsys: pytest.CaptureFixture[str], place: str, change: str | None, line: str
+    board: Path, capsys: pytest.CaptureFixture[str], place: str, change: str | None, line: str
 ) -> None:
     """By hand. A file that is there is removed, another is added."""
-    described = Described("mine", ("A. Person",), "MIT")
-    packed = submission.pack([finished], described, Path("board"), QUICK, score=evaluate)
     entry = Path("copy") / place
-    shutil.copytree(packed, entry)
+    shutil.copytree(board / ENTRY.relative_to("board"), entry)
     if change is not None:
         file = entry / change
         file.unlink() if file.exists() else file.write_text("mine")
@@ -523,9 +535,8 @@ def test_an_entry_that_was_moved_or_changed(
 
 
 def test_directories_that_are_no_entry_or_no_run(
-    finished: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, entered: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert submit("one") == 0
     for place in ("one", str(ENTRY / "seed3"), str(ENTRY.parent)):
         assert cli.main(["verify", place, "--quick"]) == 1
         assert f"{place} is no entry, it has no manifest.json: {MADE}" in capsys.readouterr().out
@@ -665,8 +676,7 @@ def test_another_mujoco_is_not_verified(finished: Path, capsys: pytest.CaptureFi
     assert not ENTRY.exists()
 
 
-def test_the_hidden_seed(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert submit("one") == 0
+def test_the_hidden_seed(entered: None, capsys: pytest.CaptureFixture[str]) -> None:
     Path("seed.txt").write_text("0123456789abcdef" * 4 + "\n")
     words = ["verify", str(ENTRY), "--board", "board", "--seed-file", "seed.txt"]
     assert cli.main(words) == 2
@@ -685,11 +695,10 @@ def test_the_hidden_seed(finished: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_a_score_that_hangs_on_a_lucky_seed_shows(
-    finished: Path, monkeypatch: pytest.MonkeyPatch
+    entered: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two standard errors and a half of the difference are chance, more is not: by hand, 100
     episodes of variance 0.04 each, so 2.576 x sqrt(0.08 / 100) = 0.0729."""
-    assert submit("one") == 0
     entry = submission.read_entry(ENTRY)
     deviations = np.resize([0.2, -0.2], 100) * np.sqrt(0.99)  # of variance 0.04 with ddof=1
     for drop, holds in ((0.07, True), (0.075, False)):
@@ -700,8 +709,7 @@ def test_a_score_that_hangs_on_a_lucky_seed_shows(
         assert verdict.passed is holds, verdict.reasons
 
 
-def test_training_again(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert submit("one") == 0
+def test_training_again(entered: None, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(execute, "SMOKE", QUICK)
         assert cli.main(["verify", str(ENTRY), "--retrain"]) == 0
