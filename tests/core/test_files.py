@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from pathlib import Path
 
@@ -10,6 +11,13 @@ import pytest
 
 from tsbench.core import files
 from tsbench.core.errors import TsbenchError
+
+
+def test_json_has_lists_on_a_line_and_texts_as_they_are() -> None:
+    content = {"a": [1, [2, 3]], "b": 'x [1,   2] "y [3,  4]', "c": ["p", []], "d": ""}
+    text = files.encode_json(content).decode()
+    assert json.loads(text) == content
+    assert "[ 2, 3 ]" in text
 
 
 def test_a_write_follows_no_link(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tsbench.core.method import Budget, Problem, Workspace
 from tsbench.core.motion import ReferenceMotion
 from tsbench.core.policy import ENCODINGS, Policy
 from tsbench.rl.ppo import Learner
-from tsbench.rl.settings import PPOSettings
+from tsbench.rl.settings import AFTER_IMITATION, PPOSettings
 from tsbench.rl.stages import StageSettings, learn_planning, settings
 from tsbench.rl.vec_env import TorchEnvironment
 from tsbench.sim.batched import BatchedEnvironment
@@ -389,6 +389,17 @@ def test_settings() -> None:
     # Fine-tuning continues with the network of the imitation stage.
     both = problem(imitate={"hidden": [8], "entropy": 0.1}, finetune={"entropy": 0.2})
     assert settings(both, "finetune") == StageSettings(hidden=(8,), entropy=0.2)
+
+
+@pytest.mark.parametrize(
+    "other", [{"hidden": [9]}, {"activation": "tanh"}, {"encoding": "symlog"}], ids=str
+)
+@pytest.mark.parametrize("kind", AFTER_IMITATION)
+def test_a_stage_goes_on_with_the_network_that_there_is(kind: str, other: dict[str, Any]) -> None:
+    (name,) = other
+    with pytest.raises(TsbenchError, match=rf"^task\.training\.{kind}\.{name} must be that of imi"):
+        settings(problem(**{"imitate": {"hidden": [8]}, kind: other}), kind)
+    assert settings(problem(**{"imitate": other, kind: other}), kind)
 
 
 def test_finetuning_is_pushed_as_hard_as_the_imitation_was_in_the_end() -> None:

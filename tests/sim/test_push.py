@@ -164,6 +164,12 @@ def test_pushes_that_make_no_sense(changes: dict[str, Any], message: str) -> Non
         Push(**{"time": 0.1, "duration": 0.1, "force": np.zeros(3), **changes})
 
 
+def test_pushes_may_be_lists() -> None:
+    pushes = Push([0.1, 0.2], [0.3, 0.4], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # type: ignore[arg-type]
+    (time,), (duration,), (force,) = vars(pushes.rows(np.array([1]))).values()
+    assert (time, duration, [*force]) == (0.2, 0.4, [0.0, 1.0, 0.0])
+
+
 def test_as_many_pushes_as_episodes() -> None:
     pushes = Push(np.zeros(3), np.full(3, 0.1), np.zeros((3, 3)))
     with pytest.raises(TsbenchError, match=r"one for each of 4 episodes, not 3$"):

@@ -120,6 +120,15 @@ def test_references_of_other_sizes_are_refused(
         Imitation(tasks.make("laikago_trot"), narrow)
 
 
+def test_references_at_another_rate_are_refused(
+    naive_reference: Callable[[str], ReferenceMotion],
+) -> None:
+    """Its frames are counted as control steps."""
+    slow = replace(naive_reference("laikago_trot"), timestep=0.1)
+    with pytest.raises(TsbenchError, match=r"time step of 0\.1 s, which does not fit .* 0\.0333333 s"):
+        Imitation(tasks.make("laikago_trot"), slow)
+
+
 def test_form(naive_reference: Callable[[str], ReferenceMotion]) -> None:
     name = "rocket_navigation"
     task, reference = tasks.make(name), naive_reference(name)

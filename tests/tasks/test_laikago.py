@@ -703,6 +703,23 @@ def test_audit_finds_what_is_wrong(
     assert len(failures) <= 2
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_foot_that_never_stands_does_not_slip(naive_plan: Callable[[str], Plan]) -> None:
+    """Two feet of the trot swing in the first half of a cycle, which has 16 samples."""
+    task, plan = make("laikago_trot"), naive_plan("laikago_trot")
+    short = replace(plan, states=plan.states[:6], rewards=plan.rewards[:5])
+    items = task.audit(short, task.reference(short)).items
+    (slip,) = (item.value for item in items if "slip" in item.what)
+    assert slip == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_plan_of_tiny_steps_is_refused(naive_plan: Callable[[str], Plan]) -> None:
+    """It would go on to the horizon for days."""
+    plan = replace(naive_plan("laikago_trot"), timestep=1e-9)
+    with pytest.raises(TsbenchError, match=r"plan has a time step of 1e-09 s, which does not fit"):
+        make("laikago_trot").check_fit(plan)
+
+
 @pytest.mark.parametrize("name", GAITS)
 def test_audit_finds_dragged_feet(name: str, naive_plan: Callable[[str], Plan]) -> None:
     """The feet of the plan stay under their hips, also in stance."""

@@ -407,6 +407,15 @@ def test_reference_is_the_plan_interpolated() -> None:
     assert not reference.tracked
 
 
+def test_a_plan_shorter_than_a_control_step_has_a_reference() -> None:
+    states = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    plan = Plan("rocket_navigation", 1, 0.01, states, np.zeros(1))
+    rocket().check_fit(plan)
+    reference = rocket().reference(plan)
+    np.testing.assert_allclose(reference.qpos, states)
+    np.testing.assert_allclose(reference.qvel, np.tile([5.0, 0.0, 0.0], (2, 1)))
+
+
 def test_audit_of_the_naive_plans(
     naive_plan: Callable[[str], Plan], naive_reference: Callable[[str], ReferenceMotion]
 ) -> None:

@@ -271,10 +271,14 @@ def write_json(path: Path | None, content: Any) -> None:
         write_new(path, encode_json(content))
 
 
+# A text, which stays as it is, or a list without texts, lists and objects.
+_LIST = re.compile(r'("(?:[^"\\]|\\.)*")|\[[^][{}"]*\]')
+
+
 def encode_json(content: Any) -> bytes:
     """The bytes of a JSON file that `write_json` writes: every list of plain values on one line."""
     text = json.dumps(content, indent=2)
-    return (re.sub(r"\[[^][{}\"]*\]", lambda one: " ".join(one[0].split()), text) + "\n").encode()
+    return (_LIST.sub(lambda one: one[1] or " ".join(one[0].split()), text) + "\n").encode()
 
 
 def lock(path: Path, *, wait: bool) -> int | None:

@@ -415,6 +415,7 @@ class Plannable(Task[S]):
 
         Raises:
             TsbenchError: the motion is for another task or version, is far longer than an episode,
+                its time step is far shorter than a control step or, of a reference motion, another,
                 or its arrays have other sizes.
         """
         self.check_origin(motion)
@@ -426,6 +427,13 @@ class Plannable(Task[S]):
             raise TsbenchError(
                 f"the {motion.kind} is too long: {frames} frames every {motion.timestep:g} s, "
                 f"where an episode has {self.horizon} steps of {self.timestep:g} s"
+            )
+        if motion.timestep * MOST_FRAMES < self.timestep or (
+            isinstance(motion, ReferenceMotion) and not np.isclose(motion.timestep, self.timestep)
+        ):
+            raise TsbenchError(
+                f"the {motion.kind} has a time step of {motion.timestep:g} s, which does not fit "
+                f"the control steps of {self.timestep:g} s"
             )
         found: dict[str, tuple[int, ...]]
         wanted: dict[str, tuple[int, ...]]

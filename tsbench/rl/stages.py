@@ -72,13 +72,20 @@ def settings(problem: Problem, kind: str) -> StageSettings:
 
 def _changes(problem: Problem, kind: str) -> dict[str, Any]:
     """The settings that differ from the defaults. The stages after `imitate` continue with its
-    policy, so their settings are changes to those of `imitate`. Their pushes start at full size,
-    which those of the imitation stage have reached."""
+    policy, so their settings are changes to those of `imitate`, with the same network. Their pushes
+    start at full size, which those of the imitation stage have reached."""
     given, path = problem.training.get(kind, {}), f"task.training.{kind}"
     changes = typed_items(StageSettings, given, path)
     if kind not in AFTER_IMITATION:
         return changes
     before = _changes(problem, "imitate")
+    for name in ("hidden", "activation", "encoding"):
+        imitated = before.get(name, getattr(StageSettings, name))
+        if changes.get(name, imitated) != imitated:
+            raise TsbenchError(
+                f"{path}.{name} must be that of imitate, whose policy the stage goes on with: "
+                f"{imitated}"
+            )
     other = typed_items(Disturbances, given.get("disturb", {}), f"{path}.disturb")
     disturb: Disturbances = before.get("disturb", Disturbances())
     try:

@@ -113,7 +113,7 @@ class RslUpdate:
     def update(self) -> dict[str, float]:
         losses = self._ppo.update()
         if self._ppo.is_multi_gpu:
-            # rsl-rl averages gradients only: this keeps the normalisers of observations alike too.
+            # rsl-rl averages gradients and moments of observations: this keeps rounding alike too.
             self._ppo.broadcast_parameters()
         return losses
 

@@ -79,8 +79,9 @@ def compiled(name: str, package: str = OWN) -> mujoco.MjModel:
 
 
 def fingerprint(spec: mujoco.MjSpec) -> str:
-    """Hash of a task's MJCF with the task's additions. Numbers are rounded to nine decimals, so
-    versions of mujoco that centre a mesh at 0 and at 1e-15 give the same hash."""
+    """Hash of a task's MJCF with the task's additions. Numbers are rounded to nine decimals and to
+    six significant digits, so versions of mujoco that centre a mesh at 0 and at 1e-15 give the same
+    hash. `compiled_hash` sees all digits."""
     text = _NUMBER.sub(lambda found: f"{round(float(found[0]), 9) + 0.0:g}", spec.to_xml())
     return hashlib.sha256(text.encode()).hexdigest()
 

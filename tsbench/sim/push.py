@@ -75,7 +75,7 @@ class Push:
         """The pushes of some members of the batch; a push for all episodes is returned as it is."""
         if np.ndim(self.force) == 1:
             return self
-        return Push(np.asarray(self.time)[rows], np.asarray(self.duration)[rows], self.force[rows])
+        return Push(*(np.asarray(value)[rows] for value in vars(self).values()))
 
     def during(self, time: np.ndarray, timestep: float) -> np.ndarray:
         """The force in newtons over the control steps that begin at `time` (n,), shape (n, 3).

@@ -305,8 +305,8 @@ class Laikago(Plannable[LaikagoState]):
         The share of stance samples with the sole below 1 cm, and of swing samples with it above,
         over feet and control steps; each step is weighted by how much it lowered the smallest
         distance to the goal so far, so that stepping on the spot does not hide a dash. The
-        agreement is the mean of both: 0.5 for feet that are dragged, or never put down. 0 where no
-        ground was gained in stance or in swing.
+        agreement is the mean of both: 0.5 for feet that are dragged, or never put down. The half
+        in which no ground was gained counts as 0.
         """
         assert isinstance(course, LaikagoCourse)
         xp = array_namespace(course.nearest)
@@ -416,8 +416,9 @@ class Laikago(Plannable[LaikagoState]):
 
         Perturbed, all uniform: joints and the base's orientation per axis within `start_angle`,
         the base's velocity within `start_speed`, angular velocities within `start_spin`. The base
-        is raised by the most that tilt and bent joints can lower a sole, so that no sole starts in
-        the ground. The robot may then drop by some millimetres.
+        is raised by the most that tilt, hips and knees can lower a sole. Hardly a sole starts in
+        the ground, and by less than 2 mm, which the abduction of a leg may lower it. The robot may
+        then drop by some millimetres.
         """
         qpos = np.tile(compiled("laikago").key("home").qpos, (count, 1))
         qvel = np.zeros((count, 18))
@@ -443,7 +444,7 @@ class Laikago(Plannable[LaikagoState]):
         axis = turn / np.maximum(angle, 1e-12)
         rotation = np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=-1)
         qpos[:, 3:7] = multiply(rotation, qpos[:, 3:7])
-        # A leg is 0.5 m long and its hip 0.25 m from the base: no sole sinks deeper than this.
+        # A leg is 0.5 m long and its hip 0.25 m from the base: by these no sole sinks deeper.
         tilt = np.abs(turn[:, :2]) @ np.array([0.13, 0.22])
         bend = np.abs(joints.reshape(-1, 4, 3)[..., 1:]).max(axis=1) @ np.array([0.01, 0.16])
         qpos[:, 2] += tilt + bend
@@ -614,7 +615,8 @@ class Laikago(Plannable[LaikagoState]):
         whole = self._continued(plan)
         standing = self._feet(whole, plan.times)
         contacts = self.gait.contacts(plan.times)
-        slip = np.linalg.norm((planned - standing)[..., :2], axis=-1).mean(axis=0, where=contacts)
+        slips = np.linalg.norm((planned - standing)[..., :2], axis=-1).sum(axis=0, where=contacts)
+        slip = slips / np.maximum(contacts.sum(axis=0), 1)  # a foot may never stand
         residual = np.linalg.norm(feet - self._feet(whole, reference.times), axis=-1).max()
         lift = (feet[..., 2] - C.foot_radius).max(axis=0)
         weight = scheduled[..., None].astype(float)
@@ -707,8 +709,9 @@ class LaikagoAbstraction(Abstraction[LaikagoState]):
         return state.feet[..., 0] - state.base_position[..., :1] - hips
 
     def naive(self, state: LaikagoState) -> Array:
-        """Straight ahead at top speed. Stance feet rest, swing feet move as fast as that
-        requires."""
+        """Straight ahead at top speed. Stance feet rest. Swing feet move at the speed that the
+        swing's share of the cycle requires, but in one planning step more, so they come to lead
+        their hips, by at most `PLAN_REACH`."""
         xp = array_namespace(state.feet)
         gait, after = self.gait, state.time + PLAN_TIMESTEP
         stance = gait.contacts(state.time) & gait.contacts(after)

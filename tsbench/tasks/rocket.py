@@ -377,8 +377,9 @@ class Rocket(Plannable[RocketState]):
         return RocketAbstraction(self)
 
     def reference(self, plan: Plan) -> ReferenceMotion:
-        """The plan, interpolated linearly to the control rate."""
-        steps = int(plan.times[-1] / self.timestep + 1e-9)
+        """The plan, interpolated linearly to the control rate. A plan shorter than a control step
+        rests at its end."""
+        steps = max(1, int(plan.times[-1] / self.timestep + 1e-9))
         qpos = _along(plan, np.arange(steps + 1) * self.timestep)
         return ReferenceMotion(
             task=self.name,
