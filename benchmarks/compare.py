@@ -1,6 +1,7 @@
 """`tsbench bench` with comparisons to other libraries: `python benchmarks/compare.py --only NAME`.
 
-Each file `against_*.py` in this folder registers comparisons, as the files of `tsbench/bench` do.
+The files `against_*.py` in this folder register comparisons, as the files of `tsbench/bench` do,
+but for `against_mjlab.py`, which is a script of its own.
 They are outside the package because they need libraries that tsbench does not need:
 `pip install 'tsbench[bench]'`.
 """

@@ -4,10 +4,11 @@
 
 trains `budget=fast` with seeds 0 to 9, each as it is and with initial weights that differ by one
 millionth, which stands for another processor (`tsbench.testing.rounding`). All of the words of
-`tsbench run` but seed are allowed. A training succeeds when its last policy solves at least 95 of
-the protocol's 100 perturbed starts. A plan that fails its audit is a training that fails, and so
-are numbers that are not finite. The file gets a line for each training as it ends. Trainings that
-it has are not repeated, so that an interrupted study goes on. The table is made from the file.
+`tsbench run` but seed and threads are allowed. A training succeeds when its last policy solves at
+least 95 of the protocol's 100 perturbed starts. A plan that fails its audit is a training that
+fails, and so are numbers that are not finite. The file gets a line for each training as it ends.
+Trainings that it has are not repeated, so that an interrupted study goes on. The table is made from
+the file.
 """
 
 from __future__ import annotations

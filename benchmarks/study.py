@@ -101,6 +101,9 @@ def _jobs(words: Sequence[str]) -> Iterator[Job]:
         trials, words = int(words[0].removeprefix(TRIALS)), words[1:]
         if not words:
             raise TsbenchError(f"nothing follows {TRIALS}{trials}; words of `tsbench run` should")
+    for word in words:
+        if word.partition("=")[0] in ("directory", "threads"):
+            raise TsbenchError(f"a study chooses the directory and the threads: leave out {word}")
     for given in config.sweep(words) if words else ():
         chosen = placed(config.compose(given), given)
         prepare(chosen)

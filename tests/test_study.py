@@ -171,7 +171,13 @@ def test_a_study_names_what_is_left(study: Study) -> None:
     assert [line.split("seed=")[1].split()[0] for line in told.splitlines()] == ["0", "1"]
 
 
-@pytest.mark.parametrize("line", ["trials=x task=rocket_navigation", "trials=3", "'"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "trials=x task=rocket_navigation", "trials=3", "'",
+        "task=rocket_navigation directory=one", "task=rocket_navigation threads=2",
+    ],
+)  # fmt: skip
 def test_a_line_that_cannot_be_read_is_named(study: Study, line: str) -> None:
     status, _, error = study("", line)
     assert status == 2

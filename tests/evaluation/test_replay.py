@@ -214,7 +214,7 @@ def test_another_kind_of_machine(score: Score, log: ActionLog, group: str, name:
 
     impulse = score.robustness.survival_impulse_50
     other = replace(score, robustness=replace(score.robustness, survival_impulse_50=1.05 * impulse))
-    assert differences(other, score, BEST) == []
+    assert differences(other, score, TASK) == []
     assert (
         "survival_impulse_50 is not that of the surface"
         in compare(replace(other, origin=there.origin), score, TASK, log).words
@@ -237,16 +237,35 @@ def test_a_difference_of_just_the_tolerance(score: Score) -> None:
     def spoiled(share: float) -> Score:
         return with_perturbed(score, violations=share)
 
-    assert differences(spoiled(0.5), spoiled(0.55), BEST) == []
-    assert differences(spoiled(0.5), spoiled(0.5501), BEST) == [
+    assert differences(spoiled(0.5), spoiled(0.55), TASK) == []
+    assert differences(spoiled(0.5), spoiled(0.5501), TASK) == [
         "perturbed.violations 0.5 there, 0.5501 here"
     ]
+
+
+def test_distances_and_changed_physics_are_compared_too(score: Score) -> None:
+    """Of them 15 % of the way to the goal and of the horizon may differ."""
+    far = float(TASK.goal_distance(TASK.ideal())[0])
+    name, change = next(iter(score.changes.items()))
+    for share, words in ((0.14, []), (0.16, ["perturbed: goal_distance"])):
+        moved = with_perturbed(score, goal_distance=score.perturbed.goal_distance + share * far)
+        found = differences(moved, score, TASK)
+        assert [line[: len("perturbed: goal_distance")] for line in found] == words
+        spoiled = replace(
+            change,
+            steps=change.steps + share * TASK.horizon,
+            goal_distance=change.goal_distance + share * far,
+        )
+        other = replace(score, changes={**score.changes, name: spoiled})
+        found = differences(other, score, TASK)
+        assert len(found) == 2 * len(words)
+        assert all(line.startswith(f"{name}: ") for line in found)
 
 
 def test_rewards_are_compared_on_the_scale_of_the_best(score: Score) -> None:
     """A trot earns hundredths of the largest conceivable reward: 0.05 of that says nothing."""
     other = with_perturbed(score, normalized_reward=score.normalized_reward + 0.06 * BEST)
-    found = differences(other, score, BEST)
+    found = differences(other, score, TASK)
     assert [words.split()[0] for words in found] == ["perturbed.normalized_reward"]
 
 

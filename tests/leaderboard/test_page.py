@@ -83,6 +83,25 @@ def test_rows_are_sorted_and_say_how_sure_they_are(board: Path) -> None:
     assert table.references["oracle"]["solved_reward"] == table.best > 0.0
 
 
+def test_an_entry_that_failed_stands_last_and_says_so(board: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "board"
+    shutil.copytree(board, copy)
+    one = copy / "v1" / TASK / "one"
+    (row,) = (row for table in page.tables(copy)[0] for row in table.rows if row.name == "one")
+    assert row.label == "re-scored"
+    asked = verify.verify(one, verify.Asked(rescore=False))
+    reasons = (*asked.reasons, "FAILED: not re-scored: seed1 was compared: DIFFERENT")
+    verify.record(copy, one, replace(asked, passed=False, reasons=reasons))
+    found, left_out = page.tables(copy)
+    (table,) = (table for table in found if table.rows)
+    assert [row.label for row in table.rows] == ["submitted", "replayed, then FAILED"]
+    text = page.markdown(found, left_out, "# Leaderboards\n")
+    assert re.search(r"\| one \|.*\| replayed, then FAILED \|", text)
+    assert [row["passed"] for row in page.plain([table], [])["tables"][0]["rows"]] == [True, False]
+    index = page.write_site(copy, tmp_path / "site", None, lambda line: None)[-1]
+    assert '<span class="state failed">replayed, then FAILED</span>' in index.read_text()
+
+
 def test_tables_in_markdown(board: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["leaderboard", "--board", str(board), "--readme"]) == 0
     capsys.readouterr()

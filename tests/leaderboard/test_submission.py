@@ -209,6 +209,43 @@ def test_a_kept_verdict_is_replaced_by_a_higher_state_or_a_failure(entered: None
     assert verify.record(board, ENTRY, first) is not None
 
 
+def test_a_failure_is_replaced_by_what_passes_the_step_that_failed(entered: None) -> None:
+    board, first = Path("board"), verify.verify(ENTRY, verify.Asked(rescore=False))
+    failed = ("FAILED: not hidden-seed: seed3 earns less",)
+    verify.record(board, ENTRY, replace(first, state="re-scored", passed=False, reasons=failed))
+    again = replace(first, state="re-trained", reasons=("re-trained: seed3 was trained again",))
+    assert verify.record(board, ENTRY, again) is None
+    both = replace(again, reasons=("hidden-seed: seed3 earns as much", *again.reasons))
+    assert verify.record(board, ENTRY, both) is not None
+
+
+def test_names_of_packages_are_nothing_but_names(entered: None) -> None:
+    """Though a package may be called as an argument of a function is."""
+    training = submission.read_manifest(ENTRY).trainings[0]
+    versions = {"command": "1", "code": None, "self": "2", "texts": "3"}
+    assert replace(training, versions=versions).versions == versions
+
+
+def test_the_seconds_of_no_stages_are_written_as_they_are_read(finished: Path) -> None:
+    nothing = replace(RunDirectory(finished).record(), stages=())
+    assert json.dumps(submission.cost_of(nothing)) == "[0, 0, 0.0]"
+
+
+def test_folders_that_are_no_entries_yet_are_in_nobodys_way(
+    entered: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Runs that lie where their entry will be, and a manifest that is damaged."""
+    place = Path("kept/v1/rocket_navigation")
+    shutil.copytree(ENTRY, place / "mine")
+    shutil.copytree(ENTRY / "seed3", place / "begun" / "seed3")
+    shutil.copytree(ENTRY, place / "damaged")
+    (place / "damaged" / "manifest.json").write_text("{")
+    monkeypatch.setattr("tsbench.leaderboard.kept.FOLDERS", (Path("kept"),))
+    assert list(submission.kept_manifests()) == ["rocket_navigation/mine"]
+    assert cli.main(["describe", "rocket_navigation"]) == 0
+    assert cli.main(["describe", "twostage"]) == 0
+
+
 def test_a_board_keeps_verdicts_on_its_own_entries_alone(
     entered: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -660,9 +697,9 @@ def test_on_another_machine_every_field_is_compared(
         score, robustness=replace(score.robustness, surface=replace(surface, survived=most))
     )
     assert contradictions(forged, task)
-    assert any("of the pushes" in line for line in differences(forged, score, 1.0))
+    assert any("of the pushes" in line for line in differences(forged, score, task))
     longer = replace(score, perturbed=replace(score.perturbed, steps=score.perturbed.steps * 2))
-    assert any("perturbed: steps" in line for line in differences(longer, score, 1.0))
+    assert any("perturbed: steps" in line for line in differences(longer, score, task))
     other_score(finished, "score", "origin", "machine", "extensions", value="X86_V9")
     assert submit("one") == 0
     assert cli.main(["verify", str(ENTRY)]) == 0
@@ -866,6 +903,10 @@ def test_a_pull_request_that_is_a_submission(
         (
             lambda: Path("repo/leaderboards/v1/rocket_navigation/mine/.gitattributes").touch(),
             ".gitattributes' is no file of an entry",
+        ),
+        (
+            lambda: shutil.copytree("repo/leaderboards/v1", "repo/leaderboards/v2"),
+            "v2/rocket_navigation/mine/manifest.json' is no file of an entry",
         ),
         (
             lambda: link(Path("repo/leaderboards/v1/rocket_navigation/mine/manifest.json")),

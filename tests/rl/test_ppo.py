@@ -398,8 +398,8 @@ def test_settings() -> None:
 def test_a_stage_goes_on_with_the_network_that_there_is(kind: str, other: dict[str, Any]) -> None:
     (name,) = other
     with pytest.raises(TsbenchError, match=rf"^task\.training\.{kind}\.{name} must be that of imi"):
-        settings(problem(**{"imitate": {"hidden": [8]}, kind: other}), kind)
-    assert settings(problem(**{"imitate": other, kind: other}), kind)
+        settings(problem(None, **{"imitate": {"hidden": [8]}, kind: other}), kind)
+    assert settings(problem(None, **{"imitate": other, kind: other}), kind)
 
 
 def test_finetuning_is_pushed_as_hard_as_the_imitation_was_in_the_end() -> None:

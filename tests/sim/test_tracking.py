@@ -125,7 +125,7 @@ def test_references_at_another_rate_are_refused(
 ) -> None:
     """Its frames are counted as control steps."""
     slow = replace(naive_reference("laikago_trot"), timestep=0.1)
-    with pytest.raises(TsbenchError, match=r"time step of 0\.1 s, which does not fit .* 0\.0333333 s"):
+    with pytest.raises(TsbenchError, match=r"a time step of 0\.1 s, which does not fit"):
         Imitation(tasks.make("laikago_trot"), slow)
 
 

@@ -35,6 +35,10 @@ def test_constants_that_do_not_exist(name: str) -> None:
         tasks.make(name, distanc=1.0)
     with pytest.raises(TsbenchError, match=rf"unknown constant of {name} 'horizon'"):
         tasks.make(name, horizon=5)
+    with pytest.raises(TsbenchError, match=rf"unknown constant of {name} 'name'"):
+        tasks.make(name, name="foo")
+    with pytest.raises(TsbenchError, match=rf"unknown constant of {name} 'name'"):
+        tasks.checked(name, name="foo")
 
 
 @pytest.mark.parametrize("name", FAR)

@@ -405,6 +405,16 @@ def test_a_page_plays_when_opened_and_rests_where_asked(browser: Browser, tmp_pa
 
 
 @pytest.mark.browser
+def test_a_push_by_an_angle_is_in_the_form(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "flight.html"
+    write_page(path, rocket(), flight(0.02), 0.02, title="")
+    form = "Object.values(Object.fromEntries(new FormData(document.getElementById('push'))))"
+    for heading in ("45", "+x"):
+        with browser.open(f"{path.as_uri()}?push=100N@0.5s:{heading.replace('+', '%2B')}"):
+            assert browser.ask(form) == ["100", "0.5", heading]
+
+
+@pytest.mark.browser
 def test_a_push_is_seen_while_it_lasts(
     browser: Browser, make_run: Callable[..., Path], tmp_path: Path
 ) -> None:

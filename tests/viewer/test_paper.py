@@ -133,13 +133,15 @@ def test_what_was_tuned_is_held_against_the_tuned_method(make: Callable[..., Res
     }
 
 
+def larger(row: Result) -> Result:
+    """The row with the budget `paper`."""
+    words = tuple(word.replace("smoke", "paper") for word in row.words)
+    return replace(row, words=words, budget="paper")
+
+
 def test_a_budget_is_held_against_the_same_budget_and_has_a_panel_of_its_own(
     make: Callable[..., Result],
 ) -> None:
-    def larger(row: Result) -> Result:
-        words = tuple(word.replace("smoke", "paper") for word in row.words)
-        return replace(row, words=words, budget="paper")
-
     rows = [make(method, seed, 0.1) for method in (OURS, MONOLITHIC) for seed in (0, 1)]
     rows += [larger(make(OURS, 0, 0.3)), larger(make(MONOLITHIC, 0, 0.9))]
     groups = grouped(of(rows).groups())
@@ -188,6 +190,31 @@ def test_an_order_holds_by_its_interval_and_not_by_its_mean(make: Callable[..., 
     assert verdict([0.1] * 10, apart) is Verdict.DIFFERS
     assert verdict([0.1, 0.9] * 5, [0.9, 0.1] * 5) is Verdict.OPEN
     assert verdict(apart[:9], [0.1] * 9) is Verdict.OPEN  # too few seeds
+
+
+def test_an_order_is_told_of_one_budget(make: Callable[..., Result]) -> None:
+    rows = [make(OURS, seed, 0.5) for seed in range(3)]
+    rows += [larger(make(MONOLITHIC, seed, 0.1)) for seed in range(3)]
+    assert not list(compare(grouped(of(rows).groups()), ROCKET, OURS, MONOLITHIC, "better"))
+    rows.append(make(MONOLITHIC, 0, 0.2))
+    (claim,) = compare(grouped(of(rows).groups()), ROCKET, OURS, MONOLITHIC, "better")
+    assert "over 1 seed" in claim.found
+
+
+def test_the_physics_steps_of_a_failed_training_are_not_drawn(make: Callable[..., Result]) -> None:
+    """Nobody counted them: its curve would stand at zero."""
+    stages = (Stage("imitate", 50, steps=50, physics_substeps=1000),)
+    rows = [replace(make(OURS, seed, 0.5), stages=stages) for seed in (0, 1)]
+    rows[1] = replace(rows[1], score=None, failure="no way")
+    curve = Curve("imitate", *np.ones((3, 2)))
+    kept = replace(of(rows), curves={row.words: (curve,) for row in rows})
+    groups = grouped(kept.groups())
+    drawn = {
+        exhibit.name: {seed for _, _, seed, *_ in exhibit.rows}
+        for exhibit in learning.exhibits(kept, groups, {ROCKET: tasks.make(ROCKET)})
+    }
+    assert drawn["learning_steps"] == {0, 1}
+    assert drawn["learning_substeps"] == {0}
 
 
 def test_what_the_paper_says_of_its_roadmap_is_not_said_of_another(

@@ -21,8 +21,7 @@ from tsbench.core.task import Plannable, Task
 from tsbench.core.words import number, several
 from tsbench.evaluation import references
 from tsbench.evaluation.words import REFERENCES
-from tsbench.leaderboard import kept
-from tsbench.leaderboard.submission import read_manifest
+from tsbench.leaderboard.submission import kept_manifests
 from tsbench.runs import schema
 
 
@@ -45,7 +44,7 @@ def show(console: Console, name: str) -> dict[str, Any]:
 def _show_method(console: Console, name: str) -> dict[str, Any]:
     about, options = inspect.getdoc(methods.find(name)) or "", list(_options(name))
     stages = methods.stages(name)
-    made = [entry for entry, path in kept.entries().items() if read_manifest(path).method == name]
+    made = [entry for entry, one in kept_manifests().items() if one.method == name]
     facts = {
         "training stages": f"{', '.join(stages)}: task.training.STAGE.KEY=..."
         if stages

@@ -27,8 +27,7 @@ from tsbench.evaluation.words import (
     unranked,
     verdict,
 )
-from tsbench.leaderboard import kept
-from tsbench.leaderboard.submission import read_manifest
+from tsbench.leaderboard.submission import kept_manifests
 from tsbench.runs.directory import Record, RunDirectory
 
 if TYPE_CHECKING:
@@ -72,11 +71,8 @@ def show_score(console: Console, title: str, score: Score, task: Task[Any], *mor
 def kept_rows(task: Task[Any]) -> Iterator[tuple[str, str, str]]:
     """Rows of a kept entry's name, its `solved_reward` (the interquartile mean over its trainings,
     as on the board) and its mean `success`, of the entries for a task."""
-    for name, entry in kept.entries().items():
-        if not name.startswith(f"{task.name}/"):
-            continue
-        manifest = read_manifest(entry)
-        if manifest.task_version == task.version:
+    for name, manifest in kept_manifests().items():
+        if (manifest.task, manifest.task_version) == (task.name, task.version):
             claims = [training.claimed for training in manifest.trainings]
             label = f"kept {name}" + (f" ({len(claims)} seeds)" if len(claims) > 1 else "")
             reward = iqm([np.array([one.solved_reward for one in claims])])

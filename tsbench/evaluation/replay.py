@@ -128,7 +128,7 @@ def compare(kept: Score, again: Score, task: Task[Any], log: ActionLog | None) -
         words = f"compared bit for bit: {'equal' if same else 'DIFFERENT'}"
         return Comparison("exact", same, words)
     differing = contradictions(kept, task)
-    differing += differences(kept, again, best_return(task) / (task.max_reward * task.horizon))
+    differing += differences(kept, again, task)
     agrees = not differing
     words = f"compared within {now.protocol.tolerance:g} ({'; '.join(others)}): "
     words += "in agreement" if agrees else f"DIFFERENT: {', '.join(differing)}"
@@ -165,16 +165,19 @@ def incomparable(before: Origin, now: Origin) -> str:
     return next((words for words, there, here in unnamed if there != here), "")
 
 
-def differences(kept: Score, again: Score, best: float) -> list[str]:
+def differences(kept: Score, again: Score, task: Task[Any]) -> list[str]:
     """The figures of two scores that differ by more than the protocol tolerates.
 
     Args:
         kept: a score.
         again: another score by the same protocol.
-        best: normalized reward of the best motion known. The tolerance of rewards is a share of
-            this reward.
+        task: of both. The tolerance of rewards is a share of the normalized reward of the best
+            motion known; that of distances a share of the distance from start to goal; that of
+            steps in changed physics, of few episodes, a share of the horizon.
     """
     protocol = again.origin.protocol
+    best = best_return(task) / (task.max_reward * task.horizon)
+    far = float(task.goal_distance(task.ideal())[0])
     first, second = _figures(kept), _figures(again)
     found = []
     for name in sorted(first.keys() | second.keys()):
@@ -186,8 +189,12 @@ def differences(kept: Score, again: Score, best: float) -> list[str]:
             bound = protocol.impulse_tolerance * max(first[name], second[name])
         elif name.endswith("_reward"):
             bound *= best
+        elif name.endswith(": goal_distance"):
+            bound *= LOOSE * far
         elif name.startswith("perturbed: "):
             bound *= LOOSE * max(abs(first[name]), abs(second[name]))
+        elif name.endswith(": steps"):
+            bound *= LOOSE * task.horizon
         # One of twenty episodes is a share of 0.05, which rounding may make larger than the bound.
         if not abs(first[name] - second[name]) <= bound * (1.0 + 1e-9):
             found.append(f"{name} {first[name]:.4g} there, {second[name]:.4g} here")
@@ -272,15 +279,20 @@ def _figures(score: Score) -> dict[str, float]:
     """The figures that are compared within a tolerance.
 
     The figures of the nominal episode are left out, because the last bit of an action may change
-    the outcome of a single episode. Its physics is replayed instead.
+    the outcome of a single episode. Its physics is replayed instead. So are the measures in changed
+    physics: of twenty episodes, few may have arrived.
     """
     return {
         "against_plan": score.against_plan,
-        "perturbed.solved_reward": score.perturbed.solved_reward,
         **{
             f"{part}.{name}": getattr(summary, name)
             for part, summary in {"perturbed": score.perturbed, **score.changes}.items()
-            for name in ("normalized_reward", "success", "violations")
+            for name in ("solved_reward", "normalized_reward", "success", "violations")
+        },
+        **{f"{name}: steps": summary.steps for name, summary in score.changes.items()},
+        **{
+            f"{part}: goal_distance": summary.goal_distance
+            for part, summary in {"perturbed": score.perturbed, **score.changes}.items()
         },
         "perturbed: steps": score.perturbed.steps,
         **{

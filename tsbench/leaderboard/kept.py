@@ -9,6 +9,7 @@ BOARD = Path("leaderboards")  # in a checkout
 # A wheel ships it inside the package; a checkout has it beside the package.
 FOLDERS = (Path(__file__).parents[1] / BOARD, Path(__file__).parents[2] / BOARD)
 PROTOCOL = "v1"  # of the kept entries
+MANIFEST = "manifest.json"  # makes a directory an entry
 _SEED = re.compile(r"seed\d{1,10}")
 _TRAINING = re.compile(rf"(.+)/({_SEED.pattern})")
 
@@ -21,6 +22,7 @@ def entries() -> dict[str, Path]:
                 f"{task.name}/{entry.name}": entry
                 for task in folders(board)
                 for entry in folders(task)
+                if (entry / MANIFEST).is_file()
             }
     return {}
 

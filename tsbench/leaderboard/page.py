@@ -30,6 +30,7 @@ from tsbench.leaderboard.verify import (
     CLAIMS,
     RETRACTED,
     STATES,
+    Verdict,
     as_markdown,
     entries,
     recorded,
@@ -52,7 +53,8 @@ class Row:
 
     Attributes:
         entry: the entry.
-        state: what the board says of it.
+        state: the last state that it has passed.
+        passed: whether the board says of nothing that it failed.
         reasons: why.
         reward: solved_reward over the training seeds.
         share: of the best reward that the board or a plan has.
@@ -64,6 +66,7 @@ class Row:
 
     entry: Entry
     state: str
+    passed: bool
     reasons: tuple[str, ...]
     reward: Aggregate
     share: float
@@ -75,6 +78,18 @@ class Row:
     @property
     def name(self) -> str:
         return self.entry.manifest.described.entry
+
+    @property
+    def label(self) -> str:
+        """What the board says of it."""
+        return self.state if self.passed else f"{self.state}, then FAILED"
+
+    @property
+    def style(self) -> str:
+        """A class more of the label's style, after a space."""
+        if not self.passed:
+            return " failed"
+        return "" if self.state in ("submitted", "replayed") else " checked"
 
     @property
     def claims(self) -> str:
@@ -105,8 +120,8 @@ COLUMNS = (
     f"{RANKED_SEEDS} on with a 95 % interval; the other figures are means over them. of the best "
     "known: solved_reward over the largest one of the task, be it an entry's or the oracle's. "
     "steps, time: of one training. state: the last step of tsbench verify that the entry has "
-    f"passed, of {', '.join(STATES)}. tuning trials: choices of settings that were tried before. "
-    "seeds: trainings that are kept."
+    f"passed, of {', '.join(STATES)}; entries that FAILED another step stand last. tuning trials: "
+    "choices of settings that were tried before. seeds: trainings that are kept."
 )
 
 
@@ -141,7 +156,7 @@ def tables(board: Path) -> tuple[list[Table], list[str]]:
     Raises:
         TsbenchError: a verdict is damaged.
     """
-    found: dict[str, list[tuple[Entry, str, tuple[str, ...]]]] = {}
+    found: dict[str, list[tuple[Entry, Verdict | None]]] = {}
     left_out = []
     for path in entries(board):
         try:
@@ -150,41 +165,37 @@ def tables(board: Path) -> tuple[list[Table], list[str]]:
             left_out.append(str(error))
             continue
         verdict = recorded(board, path)
-        state = verdict.state if verdict else STATES[0]
-        reasons = verdict.reasons if verdict else ("no verdict is recorded",)
-        if state == RETRACTED:
-            left_out.append(f"{entry.name}: {'; '.join(reasons)}")
+        if verdict is not None and verdict.state == RETRACTED:
+            left_out.append(f"{entry.name}: {'; '.join(verdict.reasons)}")
             continue
-        found.setdefault(entry.manifest.task, []).append((entry, state, reasons))
+        found.setdefault(entry.manifest.task, []).append((entry, verdict))
     return [_table(task, found.get(task, [])) for task in tasks.names()], left_out
 
 
-def _table(name: str, found: Sequence[tuple[Entry, str, tuple[str, ...]]]) -> Table:
+def _table(name: str, found: Sequence[tuple[Entry, Verdict | None]]) -> Table:
     task = tasks.make(name)
     references = dict((stored(name) or {"rows": {}})["rows"])
     best = float(references.get("oracle", {"solved_reward": 0.0})["solved_reward"])
     measure = next(iter(task.measure_notes.items()), ("", ""))
     rewards = [
         aggregate({name: {k.training.seed: k.training.claimed.solved_reward for k in entry.kept}})
-        for entry, _, _ in found
+        for entry, _ in found
     ]
-    top = max([best, *(reward.iqm for reward in rewards)], default=0.0)
+    believed = [
+        reward.iqm
+        for (_, verdict), reward in zip(found, rewards, strict=True)
+        if verdict is None or verdict.passed
+    ]
+    top = max([best, *believed])
     rows = [
-        _row(entry, state, reasons, reward, top, measure[0])
-        for (entry, state, reasons), reward in zip(found, rewards, strict=True)
+        _row(entry, verdict, reward, top, measure[0])
+        for (entry, verdict), reward in zip(found, rewards, strict=True)
     ]
-    rows.sort(key=lambda row: (-row.reward.iqm, row.name))
+    rows.sort(key=lambda row: (not row.passed, -row.reward.iqm, row.name))
     return Table(name, best, measure, tuple(rows), references)
 
 
-def _row(
-    entry: Entry,
-    state: str,
-    reasons: tuple[str, ...],
-    reward: Aggregate,
-    top: float,
-    measure: str,
-) -> Row:
+def _row(entry: Entry, verdict: Verdict | None, reward: Aggregate, top: float, measure: str) -> Row:
     scores = [kept.record.score for kept in entry.kept]
     claims = [kept.training.claimed for kept in entry.kept]
     known = [one for score in scores if (one := score.perturbed.measures.get(measure)) is not None]
@@ -199,8 +210,9 @@ def _row(
     surfaces = [np.mean(score.robustness.surface.survived, axis=-1) for score in scores]
     return Row(
         entry=entry,
-        state=state,
-        reasons=reasons,
+        state=verdict.state if verdict else STATES[0],
+        passed=verdict is None or verdict.passed,
+        reasons=verdict.reasons if verdict else ("no verdict is recorded",),
         reward=reward,
         share=reward.iqm / top if top > 0.0 else 0.0,
         figures=figures,
@@ -228,7 +240,7 @@ def markdown(found: Sequence[Table], left_out: Sequence[str], before: str) -> st
             cells = [
                 row.name, reward, f"{row.share:.0%}", number(figures["success"]),
                 number(figures["measure"]), number(figures["survival_100N"]), short(steps),
-                duration(seconds), row.state, "not said" if trials is None else str(trials),
+                duration(seconds), row.label, "not said" if trials is None else str(trials),
                 str(len(row.entry.kept)),
             ]  # fmt: skip
             lines.append(f"| {' | '.join(cells)} |")
@@ -271,6 +283,7 @@ def _plain_row(row: Row) -> dict[str, Any]:
         "substeps": substeps,
         "seconds": seconds,
         "state": row.state,
+        "passed": row.passed,
         "tuning_trials": row.entry.manifest.described.tuning_trials,
         "seeds": [kept.training.seed for kept in row.entry.kept],
     }

@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tsbench.core.errors import TsbenchError, quoted
-from tsbench.leaderboard.kept import BOARD
+from tsbench.leaderboard.kept import BOARD, PROTOCOL
 from tsbench.leaderboard.submission import FILE, MANIFEST
 
 MOST_FILES = 2000
-_PLACE = re.compile(rf"({BOARD}/v[0-9]+/[a-z0-9_]+/[a-z0-9][a-z0-9_.+-]*)/(.+)")
+_PLACE = re.compile(rf"({BOARD}/{PROTOCOL}/[a-z0-9_]+/[a-z0-9][a-z0-9_.+-]*)/(.+)")
 REGULAR = "100644"  # mode of a file that is no link and cannot be executed
 
 
@@ -42,7 +42,9 @@ def entries(repository: Path, base: str) -> tuple[list[Path], list[str]]:
         if status != "A":
             faults.append(f"{quoted(path)} is changed: a submission only adds files")
         elif match is None or not (match[2] == MANIFEST or FILE.fullmatch(match[2])):
-            faults.append(f"{quoted(path)} is no file of an entry, {BOARD}/v1/TASK/ENTRY/...")
+            faults.append(
+                f"{quoted(path)} is no file of an entry, {BOARD}/{PROTOCOL}/TASK/ENTRY/..."
+            )
         elif mode != REGULAR:
             faults.append(f"{quoted(path)} has mode {mode}, not that of a regular file")
         else:

@@ -24,6 +24,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -41,12 +42,13 @@ from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.replay import contradictions
 from tsbench.evaluation.score import Score
 from tsbench.leaderboard import coherence
+from tsbench.leaderboard.kept import MANIFEST as MANIFEST  # others use it too
+from tsbench.leaderboard.kept import entries as kept_entries
 from tsbench.runs import directory
 from tsbench.runs.directory import Record, RunDirectory, Stage
 from tsbench.runs.schema import SEEDS
 
 SCHEMA = 1  # of the manifest
-MANIFEST = "manifest.json"
 
 # The files of a training, with the bytes that each may have.
 NEEDED = {
@@ -125,7 +127,8 @@ class Training:
         _check_counts(
             steps=self.steps, physics_substeps=self.physics_substeps, seconds=self.seconds
         )
-        _check_texts(command=self.command, code=self.code, **self.versions)
+        _check_texts(command=self.command, code=self.code)
+        _check_texts(**self.versions)
 
     @property
     def folder(self) -> str:
@@ -324,6 +327,15 @@ def read_manifest(path: Path) -> Manifest:
         return Manifest.decode(content)
     except ValueError as error:
         raise TsbenchError(f"damaged manifest {path / MANIFEST}: {error}") from None
+
+
+def kept_manifests() -> dict[str, Manifest]:
+    """The manifests of the kept entries, by TASK/ENTRY, but for those that cannot be read."""
+    found = {}
+    for name, path in kept_entries().items():
+        with suppress(TsbenchError):
+            found[name] = read_manifest(path)
+    return found
 
 
 def read_entry(path: Path) -> Entry:
@@ -525,7 +537,7 @@ def cost_of(record: Record) -> tuple[int, int, float]:
     return (
         sum(stage.steps for stage in stages),
         sum(stage.physics_substeps for stage in stages),
-        round(sum(stage.seconds for stage in stages), 3),
+        round(sum((stage.seconds for stage in stages), 0.0), 3),
     )
 
 

@@ -60,6 +60,7 @@ SEED_DIGITS = 32  # hexadecimal: a hash of fewer could be searched for
 # Standard errors by which a score on the hidden seed may lie below that on the published one. A
 # policy that is equally good from both is refused once in 200 times.
 HIDDEN_ERRORS = 2.576
+_FAILED = re.compile(r"FAILED: not ([a-z-]+): ")
 RETRAINED = 0.1  # share of the claimed solved_reward that a policy trained again may lack
 
 
@@ -371,7 +372,8 @@ def check_lies_on(board: Path, entry: Path) -> None:
 
 def record(board: Path, entry: Path, verdict: Verdict) -> Path | None:
     """Writes what the board says of an entry from now on. What it said of the same files stays, and
-    nothing is written, unless the verdict is a higher state or one that did not pass.
+    nothing is written, unless the verdict is a higher state or one that did not pass. After a
+    failure a higher state is one that has passed what failed.
 
     Returns:
         The file that was written, or None.
@@ -392,7 +394,11 @@ def record(board: Path, entry: Path, verdict: Verdict) -> Path | None:
 def _replaces(verdict: Verdict, before: Verdict) -> bool:
     if RETRACTED in (verdict.state, before.state):
         return verdict.state == RETRACTED
-    return not verdict.passed or STATES.index(verdict.state) > STATES.index(before.state)
+    if not verdict.passed:
+        return True
+    failed = [found[1] for reason in before.reasons if (found := _FAILED.match(reason))]
+    mended = all(any(one.startswith(f"{step}: ") for one in verdict.reasons) for step in failed)
+    return mended and STATES.index(verdict.state) > STATES.index(before.state)
 
 
 def retracted(path: Path, reason: str) -> Verdict:

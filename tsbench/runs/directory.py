@@ -38,7 +38,7 @@ MOST_STAGES = 16  # of a run
 LARGEST = 1e15  # figures that can be drawn without an overflow
 RETURNS = ("episode_return", "normalized_return")
 
-# Limits of the files, in bytes. The largest of the kept entries are 1, 1 and 40 KB.
+# Limits of the files, in bytes. The largest of the kept entries are 3, 1 and 49 KB.
 MAX_CONFIG = 16 * 2**10
 MAX_VERSIONS = 64 * 2**10
 MAX_SCORE = 512 * 2**10

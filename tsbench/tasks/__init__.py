@@ -71,7 +71,7 @@ def defaults(name: str) -> dict[str, Any]:
     return {constant: parameter.default for constant, parameter in parameters.items()}
 
 
-def make(name: str, **constants: Any) -> Task[Any]:
+def make(name: str, /, **constants: Any) -> Task[Any]:
     """The task of that name; `constants` change what defines it (see `standard`).
 
     Raises:
@@ -96,7 +96,7 @@ def make(name: str, **constants: Any) -> Task[Any]:
         raise TsbenchError(f"{name} cannot be made{given}: {error}") from None
 
 
-def checked(name: str, **constants: Any) -> Task[Any]:
+def checked(name: str, /, **constants: Any) -> Task[Any]:
     """The task of that name, as `make`, found to keep what tasks promise.
 
     Raises:

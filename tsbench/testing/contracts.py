@@ -515,8 +515,8 @@ class MethodContract:
             methods.find(name).train(self.problem(0, no_such_option=1), Desk(tmp_path))
 
     def test_its_policy_fits_and_repeats(self, name: str, tmp_path: Path) -> None:
-        """One seed gives one policy, to the bit and after saving and loading. No stage exceeds its
-        budget by more than one rollout."""
+        """One seed gives one policy, to the bit and after saving and loading. All stages together
+        exceed the budget by no more than a rollout of each."""
         policies = []
         for attempt in ("first", "second"):
             desk, given = Desk(tmp_path / attempt), self.problem(1, name=name)

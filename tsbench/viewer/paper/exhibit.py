@@ -232,13 +232,17 @@ def interval(found: tuple[float, float] | None) -> str:
 def compare(
     groups: Sequence[Group], task: str, better: str, worse: str, says: str
 ) -> Iterator[Claim]:
-    """The paper's order of two methods on a task, beside what came out of it.
+    """The paper's order of two methods on a task, beside what came out of it with one budget.
 
     The order holds where the 95 % interval of the paired difference of `solved_reward`, which ranks
     the rows, lies above zero, and does not where it lies below. Else it cannot be told.
     """
-    first, second = (papers_group(groups, task, name) for name in (better, worse))
-    if first is None or second is None:
+    first = papers_group(groups, task, better)
+    if first is None:
+        return
+    alike = [group for group in groups if group.first.budget == first.first.budget]
+    second = papers_group(alike, task, worse)
+    if second is None:
         return
     found = difference(first, second, "solved_reward")
     if found is None:

@@ -44,6 +44,7 @@ class Axis:
         spent: what a whole stage has cost.
         along: the same at each point of the stage's curve.
         note: what to know of it.
+        known: whether a result says what its stages have cost.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Axis:
     spent: Callable[[Stage], float]
     along: Callable[[Stage, Curve], np.ndarray]
     note: str = ""
+    known: Callable[[Result], bool] = lambda row: True
 
 
 AXES = (
@@ -60,7 +62,9 @@ AXES = (
         "physics steps",
         lambda s: s.physics_substeps,
         lambda s, c: c.steps * (s.physics_substeps / s.steps),
-        " Planning takes none, so that it stands at zero.",
+        " Planning takes none, so that it stands at zero. Those of a training that failed are not "
+        "known: it is left out.",
+        lambda row: row.score is not None,
     ),
     Axis(
         "seconds",
@@ -95,12 +99,13 @@ def _exhibit(
         panels = figure.subplots(len(parts), 1, squeeze=False)[:, 0]
         for panel, (title, members) in zip(panels, parts.items(), strict=True):
             for group in members:
-                for dashes, xs, ys in _means(axis, results.curves, group.rows):
+                rows = [row for row in group.rows if axis.known(row)]
+                for dashes, xs, ys in _means(axis, results.curves, rows):
                     for x, y in zip(xs, ys, strict=True):
                         panel.plot(x, y, color=group.colour, alpha=0.35, lw=0.7, ls=dashes)
                     x, y = np.mean(xs, axis=0), np.mean(ys, axis=0)
                     panel.plot(x, y, color=group.colour, lw=2.0, ls=dashes)
-                for row in group.rows:
+                for row in rows:
                     end = sum(axis.spent(stage) for stage in row.stages)
                     panel.plot(
                         end, row.normalized_reward, "o", color=group.colour, ms=6, mec="white"
