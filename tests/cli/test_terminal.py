@@ -335,6 +335,8 @@ def test_the_name_of_a_kept_entry_may_begin_with_seed(
     monkeypatch.setattr(kept, "FOLDERS", (tmp_path,))
     entry = tmp_path / "v1" / "laikago_trot" / name
     (entry / "seed3").mkdir(parents=True)
+    assert kept.find(f"laikago_trot/{name}") is None  # runs that are no entry yet
+    (entry / "manifest.json").touch()
     assert kept.find(f"laikago_trot/{name}") == entry
     assert kept.find(f"laikago_trot/{name}/seed3") == entry / "seed3"
     assert kept.find(f"laikago_trot/{name}/seed4") is None
