@@ -24,8 +24,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
-PIECE = 45_000_000  # bytes of a file
-PART = 58_000_000  # bytes of a part
+PIECE = PART = 30_000_000  # bytes of a file, and of a part
 GLIBC = (17, 24, 26, 27, 28, 31, 34, 35)  # minor versions of glibc 2 that wheels name
 
 # What comes with torch, or with the usual image of a machine for machine learning.

@@ -261,9 +261,20 @@ def test_the_gpu_comparison_says_that_there_is_none(monkeypatch: pytest.MonkeyPa
     assert "gpu" not in [name for name in bench.names() if not bench.find(name).named]
 
 
+def _full() -> None:
+    raise TsbenchError("no room for contacts")
+
+
+def test_a_fault_on_a_gpu_leaves_the_other_figures() -> None:
+    findings = Findings()
+    with gpu.noted(findings, "laikago on cuda"):
+        _full()
+    assert findings.notes == ["laikago on cuda: no room for contacts"]
+
+
 def test_rates_on_a_device_are_of_whole_environments(capsys: pytest.CaptureFixture[str]) -> None:
     task = tasks.make("rocket_obstacles")
-    found = dict(gpu.rates(task, "warp", (2, 3), 0.01, on_cpu=4))
+    found = dict(gpu.rates(task, "warp", (2, 3), 0.01)) | dict(gpu.rates_on_cpu(task, 4, 0.01))
     names = [f"{kind}.{count}" for count in (2, 3) for kind in ("physics", "environment")]
     assert list(found) == [*names, "environment.4.cpu"]
     assert all(figure.least > 0.0 for figure in found.values())

@@ -50,7 +50,8 @@ DRAWN = 16  # different actions, drawn in advance
 @comparison("gpu", named=True)
 def compare(effort: Effort) -> Findings:
     """Of the task of each robot whose physics costs most, and of trainings of the first task with a
-    planning variant. Prints each figure when it has been measured."""
+    planning variant: first on the GPU, then on the CPU. Prints each figure when it has been
+    measured. What fails is a note."""
     findings = Findings()
     try:
         torch_device(DEVICE)
@@ -58,15 +59,30 @@ def compare(effort: Effort) -> Findings:
         findings.notes.append(f"gpu: not measured, {error}")
         return findings
     findings.machine |= described(DEVICE)
-    for robot, group in domains().items():
-        seconds = SHARE * effort.seconds
-        for name, figure in rates(richest(group), DEVICE, COUNTS, seconds, effort.count):
-            note(findings, f"{robot}.{name}", figure)
-        subject = planned(group)
-        if subject is not None:
-            for device in (DEVICE, "cpu"):
-                findings.add(trained(robot, subject.name, device, effort.iterations))
+    seconds = SHARE * effort.seconds
+    for device in (DEVICE, "cpu"):
+        for robot, group in domains().items():
+            task, subject = richest(group), planned(group)
+            with noted(findings, f"{robot} on {device}"):
+                for name, figure in (
+                    rates(task, DEVICE, COUNTS, seconds)
+                    if device == DEVICE
+                    else rates_on_cpu(task, effort.count, seconds)
+                ):
+                    note(findings, f"{robot}.{name}", figure)
+            if subject is not None:
+                with noted(findings, f"{robot}, training on {device}"):
+                    findings.add(trained(robot, subject.name, device, effort.iterations))
     return findings
+
+
+@contextmanager
+def noted(findings: Findings, what: str) -> Iterator[None]:
+    """Makes a note of an error, so that the other figures are measured."""
+    try:
+        yield
+    except TsbenchError as error:
+        findings.notes.append(f"{what}: {error}")
 
 
 def note(findings: Findings, name: str, figure: Range) -> None:
@@ -76,16 +92,15 @@ def note(findings: Findings, name: str, figure: Range) -> None:
 
 
 def rates(
-    task: Task[Any], device: str, counts: tuple[int, ...], seconds: float, on_cpu: int
+    task: Task[Any], device: str, counts: tuple[int, ...], seconds: float
 ) -> Iterator[tuple[str, Range]]:
-    """Rates of physics and environment by number of worlds, and those of the CPU.
+    """Rates of physics and environment by number of worlds.
 
     Args:
         task: that is stepped.
         device: as in a run's configuration.
         counts: numbers of worlds.
         seconds: of measuring each figure.
-        on_cpu: environments stepped together on the CPU.
     """
     where = torch_device(device)
     warp = import_module("tsbench.sim.warp")  # of an extra
@@ -99,11 +114,15 @@ def rates(
         step = partial(act, environment, itertools.cycle(drawn))
         yield f"environment.{count}", rate(step, count, seconds, where)
         environment.check()
-    batch = BatchedEnvironment(task, Physics(task, on_cpu), on_cpu, 0)
+
+
+def rates_on_cpu(task: Task[Any], count: int, seconds: float) -> Iterator[tuple[str, Range]]:
+    """The rate of the environment by C MuJoCo, of `count` episodes."""
+    batch = BatchedEnvironment(task, Physics(task, count), count, 0)
     batch.reset()
-    noise = np.random.default_rng(0).normal(0.0, NOISE, (DRAWN, on_cpu, task.action_size))
+    noise = np.random.default_rng(0).normal(0.0, NOISE, (DRAWN, count, task.action_size))
     step = partial(act, batch, itertools.cycle(noise))
-    yield f"environment.{on_cpu}.cpu", rate(step, on_cpu, seconds, torch.device("cpu"))
+    yield f"environment.{count}.cpu", rate(step, count, seconds, torch.device("cpu"))
 
 
 def act(environment: Any, actions: Iterator[Any]) -> None:

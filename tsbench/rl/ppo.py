@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from rsl_rl.models import MLPModel
+from rsl_rl.modules import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 
 from tsbench.core.errors import NotFiniteError, TsbenchError
@@ -32,6 +33,16 @@ from tsbench.sim.model import fingerprint
 
 Prepare = Callable[[int], None]  # (environment steps so far)
 Report = Callable[[int, Mapping[str, float]], None]  # (environment steps so far, metrics)
+
+
+class Gaussian(GaussianDistribution):
+    """rsl-rl's, whose draws make a GPU wait: `torch.normal` looks whether a deviation is negative.
+    These are the same to the last bit."""
+
+    def sample(self) -> torch.Tensor:
+        with torch.no_grad():
+            drawn: torch.Tensor = self._distribution.rsample()
+        return drawn
 
 
 class Learner:
@@ -98,7 +109,7 @@ class Learner:
             # deviation little. Learned directly, the deviation collapses within some updates on
             # seeds that have not found rewarding actions yet.
             distribution_cfg={
-                "class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log",
+                "class_name": Gaussian, "init_std": s.initial_std, "std_type": "log",
             },
         )  # fmt: skip
         with torch.no_grad():  # so that initial mean actions are nearly zero, the nominal pose

@@ -8,9 +8,10 @@ from typing import Any
 from torch.utils._python_dispatch import TorchDispatchMode
 
 # What reads a value on the host, makes a shape depend on one, or sends a number to the device. A
-# CUDA graph cannot be recorded of any of them.
+# CUDA graph cannot be recorded of any of them. `normal`, unlike `normal_`, reads whether a standard
+# deviation is negative.
 WAITING = frozenset(
-    {"_local_scalar_dense", "nonzero", "masked_select", "unique", "lift_fresh", "item"}
+    {"_local_scalar_dense", "nonzero", "masked_select", "unique", "lift_fresh", "item", "normal"}
 )
 
 
