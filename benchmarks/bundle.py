@@ -5,8 +5,8 @@
     PYTHONPATH=SITE:. python3 -m tsbench bench --only gpu
 
 The machine is expected to have torch, which is large, and what usually comes with it (`HAVE`). The
-wheels are for Linux on x86-64. Those larger than `PIECE` are split, and `part1`, `part2`, ... hold
-at most `PART` each, so that they can be sent one by one.
+wheels are for Linux on x86-64. `part1`, `part2`, ... hold at most `PART` each, so that they can be
+sent one by one; larger wheels are split.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
-PIECE = PART = 30_000_000  # bytes of a file, and of a part
+PART = 30_000_000  # bytes
 GLIBC = (17, 24, 26, 27, 28, 31, 34, 35)  # minor versions of glibc 2 that wheels name
 
 # What comes with torch, or with the usual image of a machine for machine learning.
@@ -99,11 +99,11 @@ def split(wheels: list[Path], folder: Path) -> int:
     pieces: list[tuple[str, bytes]] = []
     for wheel in wheels:
         data = wheel.read_bytes()
-        if len(data) <= PIECE:
+        if len(data) <= PART:
             pieces.append((wheel.name, data))
             continue
-        starts = range(0, len(data), PIECE)
-        pieces += [(f"{wheel.name}.{i:02}", data[s : s + PIECE]) for i, s in enumerate(starts)]
+        starts = range(0, len(data), PART)
+        pieces += [(f"{wheel.name}.{i:02}", data[s : s + PART]) for i, s in enumerate(starts)]
     parts: list[int] = []  # bytes in each
     for name, data in sorted(pieces, key=lambda piece: -len(piece[1])):
         fitting = [i for i, size in enumerate(parts) if size + len(data) <= PART]

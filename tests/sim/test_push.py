@@ -165,7 +165,8 @@ def test_pushes_that_make_no_sense(changes: dict[str, Any], message: str) -> Non
 
 
 def test_pushes_may_be_lists() -> None:
-    pushes = Push([0.1, 0.2], [0.3, 0.4], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # type: ignore[arg-type]
+    lists: Any = ([0.1, 0.2], [0.3, 0.4], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    pushes = Push(*lists)
     (time,), (duration,), (force,) = vars(pushes.rows(np.array([1]))).values()
     assert (time, duration, [*force]) == (0.2, 0.4, [0.0, 1.0, 0.0])
 

@@ -60,15 +60,15 @@ def compare(effort: Effort) -> Findings:
         return findings
     findings.machine |= described(DEVICE)
     seconds = SHARE * effort.seconds
-    for device in (DEVICE, "cpu"):
+    rates_on = {
+        DEVICE: partial(rates, device=DEVICE, counts=COUNTS, seconds=seconds),
+        "cpu": partial(rates_on_cpu, count=effort.count, seconds=seconds),
+    }
+    for device, rates_of in rates_on.items():
         for robot, group in domains().items():
-            task, subject = richest(group), planned(group)
+            subject = planned(group)
             with noted(findings, f"{robot} on {device}"):
-                for name, figure in (
-                    rates(task, DEVICE, COUNTS, seconds)
-                    if device == DEVICE
-                    else rates_on_cpu(task, effort.count, seconds)
-                ):
+                for name, figure in rates_of(richest(group)):
                     note(findings, f"{robot}.{name}", figure)
             if subject is not None:
                 with noted(findings, f"{robot}, training on {device}"):

@@ -25,7 +25,8 @@ from tsbench.evaluation.references import stored
 from tsbench.evaluation.statistics import RANKED_SEEDS, Aggregate, aggregate
 from tsbench.evaluation.words import FIGURES
 from tsbench.leaderboard import recipe
-from tsbench.leaderboard.submission import MANIFEST, Entry, read_entry
+from tsbench.leaderboard.kept import MANIFEST
+from tsbench.leaderboard.submission import Entry, read_entry
 from tsbench.leaderboard.verify import (
     CLAIMS,
     RETRACTED,
@@ -86,10 +87,10 @@ class Row:
 
     @property
     def style(self) -> str:
-        """A class more of the label's style, after a space."""
+        """The class of the label's style; "" for the plain one."""
         if not self.passed:
-            return " failed"
-        return "" if self.state in ("submitted", "replayed") else " checked"
+            return "failed"
+        return "" if self.state in ("submitted", "replayed") else "checked"
 
     @property
     def claims(self) -> str:

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tsbench.core.errors import TsbenchError, quoted
-from tsbench.leaderboard.kept import BOARD, PROTOCOL
-from tsbench.leaderboard.submission import FILE, MANIFEST
+from tsbench.leaderboard.kept import BOARD, MANIFEST, PROTOCOL
+from tsbench.leaderboard.submission import FILE
 
 MOST_FILES = 2000
 _PLACE = re.compile(rf"({BOARD}/{PROTOCOL}/[a-z0-9_]+/[a-z0-9][a-z0-9_.+-]*)/(.+)")

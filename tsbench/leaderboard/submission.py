@@ -42,7 +42,7 @@ from tsbench.evaluation.protocol import PROTOCOLS, Protocol
 from tsbench.evaluation.replay import contradictions
 from tsbench.evaluation.score import Score
 from tsbench.leaderboard import coherence
-from tsbench.leaderboard.kept import MANIFEST as MANIFEST  # others use it too
+from tsbench.leaderboard.kept import MANIFEST
 from tsbench.leaderboard.kept import entries as kept_entries
 from tsbench.runs import directory
 from tsbench.runs.directory import Record, RunDirectory, Stage

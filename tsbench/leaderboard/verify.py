@@ -60,7 +60,7 @@ SEED_DIGITS = 32  # hexadecimal: a hash of fewer could be searched for
 # Standard errors by which a score on the hidden seed may lie below that on the published one. A
 # policy that is equally good from both is refused once in 200 times.
 HIDDEN_ERRORS = 2.576
-_FAILED = re.compile(r"FAILED: not ([a-z-]+): ")
+FAILED = "FAILED: not "  # begins a reason, before the state that was not reached
 RETRAINED = 0.1  # share of the claimed solved_reward that a policy trained again may lack
 
 
@@ -158,9 +158,9 @@ class _Findings:
             self.state = state
         self.reasons.append(f"{state}: {reason}")
 
-    def failed(self, reason: str) -> None:
+    def failed(self, state: str, reason: str) -> None:
         self.passed = False
-        self.reasons.append(f"FAILED: {reason}")
+        self.reasons.append(f"{FAILED}{state}: {reason}")
 
     def verdict(self, seconds: float) -> Verdict:
         figures = [
@@ -218,7 +218,7 @@ def _verify(entry: Entry, asked: Asked, findings: _Findings, tell: Tell) -> None
                 holds, said = False, f"broke off: {error}"
             words.append(f"{kept.run.path.name} {said}")
             if not holds:
-                findings.failed(f"not {state}: {words[-1]}")
+                findings.failed(state, words[-1])
         if not findings.passed:
             return
         if words:
@@ -396,9 +396,13 @@ def _replaces(verdict: Verdict, before: Verdict) -> bool:
         return verdict.state == RETRACTED
     if not verdict.passed:
         return True
-    failed = [found[1] for reason in before.reasons if (found := _FAILED.match(reason))]
-    mended = all(any(one.startswith(f"{step}: ") for one in verdict.reasons) for step in failed)
-    return mended and STATES.index(verdict.state) > STATES.index(before.state)
+    failed = {
+        one.removeprefix(FAILED).partition(":")[0]
+        for one in before.reasons
+        if one.startswith(FAILED)
+    }
+    reached = {one.partition(":")[0] for one in verdict.reasons}
+    return failed <= reached and STATES.index(verdict.state) > STATES.index(before.state)
 
 
 def retracted(path: Path, reason: str) -> Verdict:

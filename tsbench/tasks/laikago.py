@@ -416,9 +416,9 @@ class Laikago(Plannable[LaikagoState]):
 
         Perturbed, all uniform: joints and the base's orientation per axis within `start_angle`,
         the base's velocity within `start_speed`, angular velocities within `start_spin`. The base
-        is raised by the most that tilt, hips and knees can lower a sole. Hardly a sole starts in
-        the ground, and by less than 2 mm, which the abduction of a leg may lower it. The robot may
-        then drop by some millimetres.
+        is raised by the most that tilt, hips and knees can lower a sole. A leg's abduction, which
+        is left out, may put its sole into the ground, by less than 2 mm. Else the robot drops by
+        some millimetres.
         """
         qpos = np.tile(compiled("laikago").key("home").qpos, (count, 1))
         qvel = np.zeros((count, 18))

@@ -62,8 +62,8 @@ AXES = (
         "physics steps",
         lambda s: s.physics_substeps,
         lambda s, c: c.steps * (s.physics_substeps / s.steps),
-        " Planning takes none, so that it stands at zero. Those of a training that failed are not "
-        "known: it is left out.",
+        " Planning takes none, so that it stands at zero. Trainings that failed are left out, "
+        "because nobody counted theirs.",
         lambda row: row.score is not None,
     ),
     Axis(
